@@ -46,7 +46,7 @@ def test_odometry_of_another_name_is_found(bench):
     node = bench.run(EkfNode)
     zero, one, frames = np.zeros(3), np.eye(3), ('odom', 'base_link')
     message = to_odometry(zero, one, zero[:2], one[:2, :2], STAMP_NS, frames)
-    used = node.monitor('odom')
+    used = node.monitors['odom']
     assert bench.publish_until('/wheel_odometry', message, lambda: used.received)
     assert node.full_name('odom') == '/wheel_odometry', 'diagnostics name the topic that is used'
     announce(bench, node, Odometry, '/odom')
@@ -70,7 +70,7 @@ def test_where_there_is_a_choice_it_is_not_made(bench, others, arguments):
     assert not takes_another(node, 'odom')
     if not arguments:
         node = bench.run(EkfNode)
-        node.monitor('odom').receive()
+        node.monitors['odom'].receive()
         announce(bench, node, Odometry, '/wheels')
         assert not takes_another(node, 'odom')
 

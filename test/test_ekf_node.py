@@ -57,7 +57,7 @@ def picture(drive, k, spread=SPREAD, frame='map'):
 
 def play(bench, node, drive, begin=0.0, end=math.inf, kinds=(0, 1)):
     """Send these seconds of a drive, and wait until the node has dealt with them; the events."""
-    counts = node.monitor('odom'), node.monitor(IMAGE_POSE)
+    counts = node.monitors['odom'], node.monitors[IMAGE_POSE]
     events = [e for e in drive.events() if e[1] in kinds and begin <= (e[0] - START_NS) / 1e9 < end]
     for _, kind, index in events:
         before = counts[kind].received
@@ -78,7 +78,7 @@ def near(one, other, atol):
 
 
 def refused(node, topic):
-    return sum(node.monitor(topic).refused.values())
+    return sum(node.monitors[topic].refused.values())
 
 
 def test_live_is_offline_and_stamps_are_the_inputs(bench):
@@ -90,7 +90,7 @@ def test_live_is_offline_and_stamps_are_the_inputs(bench):
     offline = PoseFilter(FilterConfig(initial_pose=(0.0, 0.0, 0.0)))
     rig = Rig(wheel_scale=Quantity(1.02, 0.01))
     bench.publish('sfa/rig', convert.to_rig(rig, ErrorCorrelation()), latched_qos())
-    assert until(lambda: node.monitor('sfa/rig').used == 1)
+    assert until(lambda: node.monitors['sfa/rig'].used == 1)
     offline.expect(rig)
     play(bench, node, drive)
     assert until(lambda: len(transforms) == len(heard) == len(drive.stamps_ns))
@@ -150,7 +150,7 @@ def test_every_measurement_gets_its_verdict(bench):
     assert float(values[10]['d2']) > float(values[10]['threshold'])
     assert heard[10].status[0].message == 'outside the gate'
     assert read_stamp(heard[10].header.stamp) == int(drive.stamps_ns[drive.pictures[10]])
-    monitor = node.monitor(IMAGE_POSE)
+    monitor = node.monitors[IMAGE_POSE]
     assert until(lambda: monitor.used + refused(node, IMAGE_POSE) == len(drive.pictures))
     assert monitor.refused == {'outside the gate': 1}
 
@@ -203,7 +203,7 @@ def test_initialpose_and_set_pose_set_the_pose(bench):
     # It waits for the first message, however long.
     assert not until(lambda: node.status().level.name != 'DEGRADED', 1.0)
     bench.publish('initialpose', convert.to_pose_with_covariance([1, 1, 0], SPREAD, 5, 'odom'))
-    assert until(lambda: "frame is 'odom', not 'map'" in node.monitor('initialpose').refused)
+    assert until(lambda: "frame is 'odom', not 'map'" in node.monitors['initialpose'].refused)
     play(bench, node, drive, kinds=[0])
     assert abs(node.filter.state.pose[0] - (-3.0 - drive.poses[-1, 0])) < 0.1
 
@@ -221,7 +221,7 @@ def test_reset_and_pause(bench):
     images = sum(kind for _, kind, _ in events)
     # The estimate goes on by odometry, on every topic.
     assert until(lambda: len(poses) == images and len(odometries) == len(events) - images)
-    assert until(lambda: node.monitor(IMAGE_POSE).refused['paused'] == images)
+    assert until(lambda: node.monitors[IMAGE_POSE].refused['paused'] == images)
     assert node.filter.counts['measurement: accepted'] == accepted
     assert 'paused' in ' '.join(node.status().reasons)
     bench.call(SetBool, 'ekf_node/pause', SetBool.Request(data=False))
@@ -352,14 +352,14 @@ def test_what_the_model_knows_and_what_is_set_live_reaches_the_filter(bench, mon
     node.trigger_configure()
     topic, correlation = 'sfa/rig', ErrorCorrelation(0.1, 3.0)
     bench.publish(topic, convert.to_rig(Rig(), correlation), latched_qos())
-    assert until(lambda: node.monitor(topic).used == 1)
+    assert until(lambda: node.monitors[topic].used == 1)
     correct = json.loads(convert.to_rig(Rig(), correlation).data)
     wrong = [{'error_correlation': numbers} for numbers in ([], [0.5], [1.5, 1.0], [0.5, -1.0])]
     wrong += [{'wheel_scale': [math.nan, 1.0]}, {'unknown': [0.0, 0.0]}, {'camera_left': None}]
     for text in ('', '[]', *(json.dumps({**correct, **values}) for values in wrong)):
-        count = node.monitor(topic).received
+        count = node.monitors[topic].received
         bench.publish(topic, String(data=text), latched_qos())
-        assert until(lambda n=count: node.monitor(topic).received > n)
+        assert until(lambda n=count: node.monitors[topic].received > n)
     assert until(lambda: refused(node, topic) == 9)
     assert node.filter.correlation == correlation
     node.trigger_activate()
@@ -389,7 +389,7 @@ def test_after_an_error_inside_it_starts_anew_and_goes_on(bench, monkeypatch):
     monkeypatch.setattr(node.filter, 'add_odometry', add_odometry)
     monkeypatch.setattr(node.filter, 'reset', lambda: (resets.append(1), anew()))
     play(bench, node, drive, 4.0)
-    assert node.monitor('odom').refused == {'internal error: OverflowError': 1} and resets == [1]
+    assert node.monitors['odom'].refused == {'internal error: OverflowError': 1} and resets == [1]
     assert until(lambda: states[-1].data.startswith('LOCALISED'))
     assert any(not state.data.startswith('LOCALISED') for state in states[begun:])
 

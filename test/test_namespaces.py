@@ -96,7 +96,7 @@ def test_two_robots_side_by_side_locate_themselves_apart(bench, robots):
     monitors = [m for nodes in robots.values() for node in nodes for m in node.monitors.values()]
     assert not any('internal error' in reason for m in monitors for reason in m.refused)
     for k, topic in ((2, 'odom'), (0, 'image_raw')):
-        one, other = (nodes[k].monitor(topic).received for nodes in robots.values())
+        one, other = (nodes[k].monitors[topic].received for nodes in robots.values())
         assert abs(one - other) <= 3, 'one robot hears the other'
     statuses = {s.name: {v.key for v in s.values} for m in [*told] for s in m.status}
     nodes = 'omnicam_node', 'sfa_node', 'ekf_node'

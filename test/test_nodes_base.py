@@ -119,11 +119,11 @@ class Echo(LocalizationNode):
 
     def setup(self):
         self.out = self.publisher(String, 'out')
-        self.subscribe(Float64, 'in', self.take, sensor_qos())
+        self.subscribe(Float64, 'in', self.hear, sensor_qos())
         self.every(0.01, self.tick)
         self.service(Trigger, '~/fail', self.fail)
 
-    def take(self, message):
+    def hear(self, message):
         if message.data < 0:
             raise MessageError('negative')
         self.out.publish(String(data=str(1 / message.data)))
@@ -147,11 +147,11 @@ def test_what_fails_in_callbacks_timers_health_and_services_is_counted_and_ends_
     for value in (-1.0, 0.0, 2.0):
         bench.publish('in', Float64(data=value))
     assert until(lambda: heard and node.calls > 5)
-    monitor = node.monitor('in')
+    monitor = node.monitors['in']
     assert (monitor.received, monitor.used) == (3, 1)
     assert monitor.refused == {'negative': 1, 'internal error: ZeroDivisionError': 1}
     assert math.isfinite(monitor.silent_for_s()) and float(monitor.values()['rate [Hz]']) > 0
-    assert node.monitor('timer tick').refused == {
+    assert node.monitors['timer tick'].refused == {
         'not ready': 1, 'internal error: ZeroDivisionError': 1,
     }  # fmt: skip
     assert until(lambda: told and 'running' in told[-1].status[0].message)

@@ -64,18 +64,18 @@ def live(recording, monkeypatch):
     try:
         sfa = bench.run(SfaNode, model='reader.npz', **WATCH)
         ekf = bench.run(EkfNode, **FILTER)
-        assert until(lambda: ekf.monitor('sfa/rig').received == 1)
+        assert until(lambda: ekf.monitors['sfa/rig'].received == 1)
         seen, fused = bench.listen(PoseStamped, 'sfa/pose'), bench.listen(Odometry, 'ekf/odometry')
         # The latched record of the robot is there before the first picture.
-        assert until(lambda: ekf.monitor('sfa/rig').used == 1)
+        assert until(lambda: ekf.monitors['sfa/rig'].used == 1)
         inputs = [(sfa, 'panorama'), (ekf, SEEN), (ekf, 'odom')]
         for event in recording.events():
             topic, message = message_of(recording, *event)
             shown = topic == 'panorama'
             due = shown, shown and message.width == SIZE.width, not shown
-            counts = [n.monitor(t).received + one for (n, t), one in zip(inputs, due, strict=True)]
+            counts = [n.monitors[t].received + one for (n, t), one in zip(inputs, due, strict=True)]
             bench.publish(topic, message)
-            assert until(lambda c=counts: [n.monitor(t).received for n, t in inputs] == c)
+            assert until(lambda c=counts: [n.monitors[t].received for n, t in inputs] == c)
         last = int(recording.drive.stamps_ns[-1])
         assert until(lambda: fused and read_stamp(fused[-1].header.stamp) == last)
         return trajectory(seen), trajectory(fused)

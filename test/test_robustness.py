@@ -149,7 +149,7 @@ def replay(bench, drive, events, together):
     listener = bench.node.create_subscription(Odometry, 'ekf/odometry', heard.append, 1000)
     assert until(lambda: bench.node.count_publishers('ekf/odometry') == 1)
     assert until(lambda: listeners(node, 'ekf/odometry') == 1)
-    counts = node.monitor('odom'), node.monitor(SEEN)
+    counts = node.monitors['odom'], node.monitors[SEEN]
     sent = [0, 0]
     for number, (stamp_ns, kind, index) in enumerate(events, 1):
         bench.publish(*message(drive, stamp_ns, kind, index))
@@ -215,20 +215,20 @@ def test_of_panoramas_that_come_too_fast_the_newest_is_located(bench, model):
     model.free.set()
     assert until(lambda: heard and read_stamp(heard[-1].header.stamp) == START_NS + 29)
     assert len(heard) <= 3, 'those in between were dropped'
-    assert node.monitor('panorama').received == len(heard)
+    assert node.monitors['panorama'].received == len(heard)
 
 
 @ros
 def test_of_odometry_that_comes_too_fast_the_newest_is_used(bench):
     node = bench.run(EkfNode, initial_pose=[0.0, 0.0, 0.0])
     bench.publish('odom', standing(START_NS))
-    assert until(lambda: node.monitor('odom').used == 1)
+    assert until(lambda: node.monitors['odom'].used == 1)
     with held_up(bench):
         for number in range(1, 400):
             bench.publish('odom', standing(START_NS + number * 20_000_000))
     last = START_NS + 399 * 20_000_000
     assert until(lambda: node.filter.state.stamp_ns == last)
-    assert node.monitor('odom').received <= 102, 'older ones were dropped'
+    assert node.monitors['odom'].received <= 102, 'older ones were dropped'
     assert math.isfinite(node.filter.state.position_std)
 
 
@@ -245,7 +245,7 @@ def test_odometry_that_piled_up_is_fused_at_once_and_said_to_be_behind(bench):
     assert until(lambda: node.filter.state.stamp_ns == last)
     assert until(lambda: any('behind by 1.' in state.data for state in states))
     assert 'LOST' not in {state.data.partition(':')[0] for state in states}
-    assert node.monitor('odom').used == 91 and len(seen) < 10
+    assert node.monitors['odom'].used == 91 and len(seen) < 10
     bench.publish('odom', standing(last + 20_000_000))
     assert until(lambda: 'behind' not in states[-1].data)
 

@@ -121,15 +121,15 @@ def test_an_unusable_image_gives_no_pose_and_is_reported(bench, models, kind):
     models['a.npz'].explained = 0.9
     bench.publish('panorama', message(seed=77, stamp_ns=200))
     assert until(lambda: poses and read_stamp(poses[-1].header.stamp) == 200)
-    refused = node.monitor('panorama').refused
+    refused = node.monitors['panorama'].refused
     assert sum(refused.values()) == FROZEN_IMAGES - (kind == 'frozen')
 
 
 def test_panoramas_of_another_size_are_rejected_with_the_remedy(bench, models):
     node = bench.run(SfaNode, model='a.npz')
     bench.publish('panorama', message(image=np.zeros((20, 100, 3), np.uint8)))
-    assert until(lambda: node.monitor('panorama').refused)
-    (reason,) = node.monitor('panorama').refused
+    assert until(lambda: node.monitors['panorama'].refused)
+    (reason,) = node.monitors['panorama'].refused
     assert '100x20' in reason and '60x12' in reason and 'omnicam_node' in reason
     heard = bench.listen(PoseStamped, 'sfa/pose')
     bench.publish('panorama', message())
@@ -149,7 +149,7 @@ def test_malformed_images_are_counted_and_end_nothing(bench, models, transport):
         topic, bad = 'panorama/compressed', [CompressedImage(), compressed]
         good = convert.to_compressed(panorama(), 7, 'omnicam', 90)
     node = bench.run(SfaNode, model='a.npz', image_transport=transport)
-    heard, refused = bench.listen(PoseStamped, 'sfa/pose'), node.monitor(topic).refused
+    heard, refused = bench.listen(PoseStamped, 'sfa/pose'), node.monitors[topic].refused
     for count, broken in enumerate(bad, 1):
         bench.publish(topic, broken)
         assert until(lambda n=count: sum(refused.values()) == n)
@@ -163,10 +163,10 @@ def test_an_estimate_that_is_not_finite_is_never_published(bench, models):
     models['a.npz'].shift = math.nan
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
     bench.publish('panorama', message())
-    assert until(lambda: node.monitor('panorama').refused and heard)
+    assert until(lambda: node.monitors['panorama'].refused and heard)
     _, pose, covariance = convert.read_pose(heard[0])
     assert np.array_equal(pose, np.zeros(3)) and covariance[0, 0] == UNKNOWN_VARIANCE
-    assert 'no finite estimate' in next(iter(node.monitor('panorama').refused))
+    assert 'no finite estimate' in next(iter(node.monitors['panorama'].refused))
 
 
 def test_the_model_changes_while_running_and_a_bad_one_is_refused(bench, models, tmp_path):
@@ -231,12 +231,12 @@ def test_panoramas_declared_to_show_something_else_are_rejected(bench, models):
     other = dataclasses.replace(SIZE, clockwise=False)
     for count, declared in enumerate((other, SIZE), 1):
         bench.publish('panorama/info', convert.to_info(declared), latched_qos())
-        assert until(lambda n=count: node.monitor('panorama/info').used == n)
+        assert until(lambda n=count: node.monitors['panorama/info'].used == n)
         bench.publish('panorama', message(seed=count))
         if declared is SIZE:
             break
-        assert until(lambda: node.monitor('panorama').refused)
-        (reason,) = node.monitor('panorama').refused
+        assert until(lambda: node.monitors['panorama'].refused)
+        (reason,) = node.monitors['panorama'].refused
         assert 'clockwise False instead of True' in reason and 'omnicam' in reason
         assert until(lambda: told and 'clockwise' in told[-1].status[0].message)
         assert told[-1].status[0].level == DiagnosticStatus.ERROR and not heard

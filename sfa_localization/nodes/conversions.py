@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages to and from plain values; what is malformed raises MessageError with the reason.
+"""ROS messages to and from plain values; a malformed message raises MessageError with the reason.
 
-Messages are filled here and nowhere else; their fields are read in `data.messages`. Stamps are
-integer nanoseconds, poses are (x m, y m, yaw rad), covariances of poses are (3, 3) in that order.
+Messages are filled here and nowhere else; `data.messages` reads their fields. Stamps are integer
+nanoseconds, poses are (x m, y m, yaw rad), covariances of poses are (3, 3) in that order.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs import msg as geometry
 from nav_msgs.msg import Odometry
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
+from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 
 from sfa_localization.camera.encodings import encode_jpeg, read_compressed, read_raw
 from sfa_localization.camera.settings import PanoramaConfig
@@ -33,9 +33,8 @@ from sfa_localization.data.messages import NANOSECONDS, read_stamp, require_sane
 from sfa_localization.data.rig import Rig
 from sfa_localization.data.run import Image
 
-_FIXED_VARIANCE = 1e-6
-"""Variance of what a planar estimate does not hold: z, roll and pitch are fixed, not unknown."""
-_FIXED = np.diag([_FIXED_VARIANCE] * 6)
+_FIXED = np.diag([1e-6] * 6)
+"""Covariance of z, roll and pitch, which a planar estimate fixes."""
 _PLANAR, _TWIST = np.ix_([0, 1, 5], [0, 1, 5]), np.ix_([0, 5], [0, 5])
 _CORRELATION = 'error_correlation'
 
@@ -47,8 +46,8 @@ def to_stamp(stamp_ns: int) -> Time:
 
 
 def to_quaternion(yaw_rad: float) -> geometry.Quaternion:
-    """Turn about the vertical."""
-    return geometry.Quaternion(z=float(math.sin(yaw_rad / 2)), w=float(math.cos(yaw_rad / 2)))
+    """Rotation about the vertical."""
+    return geometry.Quaternion(z=math.sin(yaw_rad / 2), w=math.cos(yaw_rad / 2))
 
 
 def read_image(message: ImageMessage | CompressedImage) -> tuple[int, Image]:
@@ -59,11 +58,9 @@ def read_image(message: ImageMessage | CompressedImage) -> tuple[int, Image]:
 
 def to_image(image: Image, stamp_ns: int, frame: str) -> ImageMessage:
     """A bgr8 message of an image (H, W, 3) uint8."""
-    image = np.ascontiguousarray(image, np.uint8)
-    message = ImageMessage(encoding='bgr8', is_bigendian=0)
-    _head(message, stamp_ns, frame)
-    message.height, message.width = int(image.shape[0]), int(image.shape[1])
-    message.step = message.width * 3
+    height, width = image.shape[:2]
+    message = ImageMessage(header=_header(stamp_ns, frame), encoding='bgr8')
+    message.height, message.width, message.step = height, width, width * 3
     message.data = array.array('B', image.tobytes())
     return message
 
@@ -71,18 +68,18 @@ def to_image(image: Image, stamp_ns: int, frame: str) -> ImageMessage:
 def to_compressed(image: Image, stamp_ns: int, frame: str, quality: int) -> CompressedImage:
     """A JPEG message of an image (H, W, 3) uint8 BGR."""
     message = CompressedImage(format='bgr8; jpeg compressed bgr8')
-    _head(message, stamp_ns, frame)
+    message.header = _header(stamp_ns, frame)
     message.data = array.array('B', encode_jpeg(image, quality))
     return message
 
 
 def to_info(panorama: PanoramaConfig) -> String:
-    """What a panorama shows, for panorama/info: the settings as a JSON object."""
+    """The settings of panoramas as a JSON object, for panorama/info."""
     return String(data=json.dumps(dataclasses.asdict(panorama)))
 
 
 def read_info(message: String) -> PanoramaConfig:
-    """The settings of a panorama, from panorama/info."""
+    """The settings of panoramas from panorama/info."""
     try:
         return PanoramaConfig.from_mapping(_read_json(message), 'is no panorama')
     except ConfigError as error:
@@ -90,29 +87,26 @@ def read_info(message: String) -> PanoramaConfig:
 
 
 def read_odometry(message: Odometry) -> tuple[int, tuple[float, ...], tuple[float, float, float]]:
-    """Stamp, twist (v m/s, omega rad/s and their variances, 0 where unknown), odometry's pose."""
+    """Stamp, twist (v m/s, omega rad/s, and their variances, 0 if unknown) and odometry's pose."""
     pose = messages.read_planar(message.pose.pose.position, message.pose.pose.orientation)
     return read_stamp(message.header.stamp), messages.read_twist(message), pose
 
 
 def read_pose(message: geometry.PoseWithCovarianceStamped) -> tuple[int, Array, Array]:
-    """Stamp, pose (3,) and covariance (3, 3) of [x, y, yaw]; all zeros where it is unknown."""
+    """Stamp, pose (3,) and its covariance (3, 3), all zeros if unknown."""
     pose = np.array(messages.read_planar(message.pose.pose.position, message.pose.pose.orientation))
     covariance = np.asarray(message.pose.covariance, float).reshape(6, 6)[_PLANAR]
-    a, b, c, d, e, f, g, h, i = covariance.ravel().tolist()  # floats: arrays this small cost more
-    require_sane('covariance', a, b, c, d, e, f, g, h, i)
-    if min(a, e, i) < 0:
+    require_sane('covariance', *covariance.ravel().tolist())
+    if covariance.diagonal().min() < 0:
         raise MessageError('negative variance')
-    largest = max(a, e, i, abs(b), abs(c), abs(f))
-    if max(abs(b - d), abs(c - g), abs(f - h)) > 1e-6 * (1 + largest):
+    if np.abs(covariance - covariance.T).max() > 1e-6 * (1 + np.abs(covariance).max()):
         raise MessageError('covariance is not symmetric')
     return read_stamp(message.header.stamp), pose, covariance
 
 
 def to_pose(pose: ArrayLike, stamp_ns: int, frame: str) -> geometry.PoseStamped:
     """A pose (3,) as a message; an unknown (NaN) yaw becomes 0, because a pose has none."""
-    message = geometry.PoseStamped()
-    _head(message, stamp_ns, frame)
+    message = geometry.PoseStamped(header=_header(stamp_ns, frame))
     _fill(message.pose, pose)
     return message
 
@@ -121,8 +115,7 @@ def to_pose_with_covariance(
     pose: ArrayLike, covariance: Array, stamp_ns: int, frame: str
 ) -> geometry.PoseWithCovarianceStamped:
     """A pose (3,) and its covariance (3, 3) as a message."""
-    message = geometry.PoseWithCovarianceStamped()
-    _head(message, stamp_ns, frame)
+    message = geometry.PoseWithCovarianceStamped(header=_header(stamp_ns, frame))
     _fill(message.pose.pose, pose)
     message.pose.covariance = _full(covariance, _PLANAR)
     return message
@@ -137,8 +130,7 @@ def to_odometry(
     frames: tuple[str, str],
 ) -> Odometry:
     """Pose in frames[0] and twist (v, omega) in frames[1], with (3, 3) and (2, 2) covariances."""
-    message = Odometry(child_frame_id=frames[1])
-    _head(message, stamp_ns, frames[0])
+    message = Odometry(header=_header(stamp_ns, frames[0]), child_frame_id=frames[1])
     _fill(message.pose.pose, pose)
     message.pose.covariance = _full(covariance, _PLANAR)
     message.twist.twist.linear.x, message.twist.twist.angular.z = np.asarray(twist, float).tolist()
@@ -146,19 +138,21 @@ def to_odometry(
     return message
 
 
-def to_transform(pose: ArrayLike, stamp_ns: int, frames: tuple[str, str]) -> Any:
-    """Pose (3,) of frames[1] in frames[0] as a transform from the one to the other."""
+def to_transform(
+    pose: ArrayLike, stamp_ns: int, frames: tuple[str, str]
+) -> geometry.TransformStamped:
+    """The transform frames[0] -> frames[1] of a pose (3,) of frames[1] in frames[0]."""
     x, y, yaw = np.asarray(pose, float).tolist()
     require_sane('output', x, y, yaw)
-    message = geometry.TransformStamped(child_frame_id=frames[1])
-    _head(message, stamp_ns, frames[0])
+    message = geometry.TransformStamped(header=_header(stamp_ns, frames[0]))
+    message.child_frame_id = frames[1]
     message.transform.translation.x, message.transform.translation.y = x, y
     message.transform.rotation = to_quaternion(yaw)
     return message
 
 
 def to_array(values: ArrayLike, label: str) -> Float64MultiArray:
-    """A vector with the name of its only dimension."""
+    """A vector, and the name of its only dimension."""
     numbers = np.asarray(values, float).ravel()
     message = Float64MultiArray(data=array.array('d', numbers))
     message.layout.dim = [MultiArrayDimension(label=label, size=len(numbers), stride=len(numbers))]
@@ -166,11 +160,10 @@ def to_array(values: ArrayLike, label: str) -> Float64MultiArray:
 
 
 def to_turned(yaw_rad: float, stamp_ns: int, frame: str) -> geometry.QuaternionStamped:
-    """How far images have turned about the vertical, from any start."""
+    """The rotation of images about the vertical, relative to any of them."""
     require_sane('output', yaw_rad)
-    message = geometry.QuaternionStamped(quaternion=to_quaternion(yaw_rad))
-    _head(message, stamp_ns, frame)
-    return message
+    header, quaternion = _header(stamp_ns, frame), to_quaternion(yaw_rad)
+    return geometry.QuaternionStamped(header=header, quaternion=quaternion)
 
 
 def read_turned(message: geometry.QuaternionStamped) -> tuple[int, float]:
@@ -179,14 +172,14 @@ def read_turned(message: geometry.QuaternionStamped) -> tuple[int, float]:
 
 
 def to_rig(rig: Rig, correlation: ErrorCorrelation) -> String:
-    """What ekf_node needs to know of a model, for sfa/rig, as a JSON object: the robot, and how the
-    errors of neighboring images correlate."""
-    shared = {_CORRELATION: [correlation.share, correlation.distance_m]}
-    return String(data=json.dumps(rig.to_mapping() | shared))
+    """The model's record of the robot, and the correlation of neighboring images' errors, as a JSON
+    object for sfa/rig."""
+    numbers = [correlation.share, correlation.distance_m]
+    return String(data=json.dumps(rig.to_mapping() | {_CORRELATION: numbers}))
 
 
 def read_rig(message: String) -> tuple[Rig, ErrorCorrelation]:
-    """The same from sfa/rig. Raises MessageError."""
+    """The robot and the correlation from sfa/rig. Raises MessageError."""
     values = _read_json(message)
     try:
         share, distance_m = map(float, values.pop(_CORRELATION))
@@ -206,15 +199,15 @@ def _read_json(message: String) -> dict[str, Any]:
     return values
 
 
-def _full(covariance: Array, places: Any) -> NDArray[np.float64]:
-    """The 36 numbers of a message, of which those at these places are known."""
+def _full(covariance: Array, places: Any) -> Array:
+    """The covariance (36,) of a message from its rows and columns at `places`."""
     full = _FIXED.copy()
     full[places] = covariance
     return full.ravel()
 
 
-def _head(message: Any, stamp_ns: int, frame: str) -> None:
-    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
+def _header(stamp_ns: int, frame: str) -> Header:
+    return Header(stamp=to_stamp(stamp_ns), frame_id=frame)
 
 
 def _fill(message: Any, pose: ArrayLike) -> None:

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""An input that nobody publishes on: what there is instead, found by its type."""
+"""Topics of an input's type, for an input that nobody publishes on."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from sfa_localization.nodes.monitor import steady_s
 PATIENCE_S = 3.0
 """Time before another topic is taken: drivers of cameras and wheels may start after this node."""
 _OUTPUTS = '/ekf/odometry', '/panorama', '/panorama/compressed'
-"""Odometry and images of this package's nodes, as a bag may hold them: never an input."""
+"""Odometry and images of this package's nodes, which a bag may hold: never an input."""
 
 
 class Discovery:
     """Looks for topics of the types `kinds`, of which the first is that of the input `topic`.
 
     `arguments` of the launch file choose another topic: the first is the input's. `take` is called
-    with the only topic that qualifies, where the input was not remapped, and with the input's own
-    when somebody publishes on that again.
+    with the only topic that qualifies, unless the input was remapped, and with the input's own
+    topic when somebody publishes on that again.
     """
 
     def __init__(
@@ -35,57 +35,53 @@ class Discovery:
         self._node, self._topic, self._arguments = node, topic, arguments
         self._types = [f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}' for kind in kinds]
         self._start_s = steady_s()
-        self._given = node.resolve_topic_name(topic)
-        remapped = self._given != node.resolve_topic_name(topic, only_expand=True)
+        self._expected = node.resolve_topic_name(topic)
+        remapped = self._expected != node.resolve_topic_name(topic, only_expand=True)
         self._take = None if remapped else take
-        self._taken = False
+        self._has_substitute = False
         self.hint = ''
         """Which topics there are, while nobody publishes on that of the input."""
         node.every(1.0, self.look)
 
     def look(self) -> None:
-        """Take a topic, or log, and keep in `hint`, which ones there are."""
+        """Take a topic, or update `hint` and log it."""
         early = steady_s() < self._start_s + PATIENCE_S
-        expected = self._node.count_publishers(self._given)
-        if self._taken and expected and self._take is not None:
-            self._taken = False
-            self._take(self._given)
-        elif early or expected or self._node.monitor(self._topic).received:
+        published = self._node.count_publishers(self._expected)
+        if self._has_substitute and published and self._take is not None:
+            self._has_substitute = False
+            self._take(self._expected)
+        elif early or published or self._node.monitors[self._topic].received:
             self.hint = ''
-        elif not self._taken:
+        elif not self._has_substitute:
             self._choose()
 
     def _choose(self) -> None:
-        named = sorted(self._node.get_topic_names_and_types())
-        own = {(self._node.get_name(), self._node.get_namespace())}
-        there = [
+        this_node = {(self._node.get_name(), self._node.get_namespace())}
+        topics = [
             (name, kind)
             for kind in self._types
-            for name, kinds in named
-            if kind in kinds and self._publishers(name) - own
+            for name, kinds in sorted(self._node.get_topic_names_and_types())
+            if kind in kinds and self._publishers(name) - this_node
         ]
-        usable = [n for n, kind in there if kind == self._types[0] and self._qualifies(n)]
+        usable = [n for n, kind in topics if kind == self._types[0] and self._qualifies(n)]
         if self._take is not None and len(usable) == 1:
-            self._taken, self.hint = True, ''
+            self._has_substitute, self.hint = True, ''
             self._node.get_logger().warning(
-                f'nobody publishes on {self._given}: taking {usable[0]}, the only '
+                f'nobody publishes on {self._expected}: taking {usable[0]}, the only '
                 f'{self._types[0]}; {self._arguments[0]}:={usable[0].removesuffix("/compressed")} '
                 'makes this permanent'
             )
             self._take(usable[0])
-        else:
-            self._tell(there)
-
-    def _tell(self, there: list[tuple[str, str]]) -> None:
-        listed = ', '.join(f'{name} ({kind})' for name, kind in there)
+            return
+        listed = ', '.join(f'{name} ({kind})' for name, kind in topics)
         choices = ' or '.join(f'{argument}:=NAME' for argument in self._arguments)
-        hint = f'nobody publishes on {self._given}; there are {listed}: {choices}'
+        hint = f'nobody publishes on {self._expected}; there are {listed}: {choices}'
         before, self.hint = self.hint, hint if listed else ''
         if self.hint not in ('', before):
             self._node.get_logger().warning(self.hint)
 
     def _qualifies(self, name: str) -> bool:
-        """No output of this package, and in no namespace where only other nodes are."""
+        """Whether a topic is no output of this package, and in no other robot's namespace."""
         below = self._node.get_namespace().rstrip('/') + '/'
         spaces = {f'{space}/' for _, space in self._node.get_node_names_and_namespaces()}
         others = tuple(space for space in spaces if len(space) > len(below))

@@ -27,7 +27,6 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import uncertainty
 from sfa_localization.fusion.track import Pose
 from sfa_localization.nodes import conversions as convert
-from sfa_localization.nodes.broadcast import Broadcast
 from sfa_localization.nodes.discovery import Discovery
 from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, sensor_qos
 from sfa_localization.nodes.monitor import steady_s
@@ -42,19 +41,20 @@ except ImportError:  # the pip wheels of ROS have none
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 _LEVELS = dict(zip(Level, (_WARN, _OK, _WARN, _ERROR), strict=True))
 PATH_PERIOD_S, PATH_LENGTH = 0.5, 2000
-"""Time between the poses of ekf/path, and how many it keeps: those of 17 minutes."""
+"""Time between the poses of ekf/path, and their largest number: 17 minutes."""
 IMAGES_SILENCE = 3.0
-"""Images may be silent for so many times silence_timeout: they come less often than odometry."""
+"""Images may be silent this many times longer than odometry, because they come less often."""
 _WATCH_PERIOD_S = 0.2
-_PILED_S = 0.2  # odometry that waits for longer is published so often only
+_BACKLOG_S = 0.2  # odometry that waited for longer is fused, but not published each time
 _BEHIND_LOG_S = 60.0  # between warnings in the log that this node is behind
-_REPEAT_STATE_S = 0.9  # between states of the same level, with other reasons
-_BACKWARD_JUMP_NS = -500_000_000  # of simulated time: less is jitter
+_REPEAT_STATE_S = 0.9  # between states of the same level with other reasons
+_OFF_GRID_NS = 500  # added to transforms of the future: tf2 rejects a stamp that it has already
+_BACKWARD_JUMP_NS = -500_000_000  # of simulated time; less is jitter
 _ODOM, _IMAGE_POSE = 'odom', 'sfa/pose_with_covariance'
 
 
 class EkfNode(LocalizationNode):
-    """Feeds the pose filter; publishes its estimate and how far that can be trusted."""
+    """Feeds the pose filter; publishes its estimate, and how reliable that is."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('ekf_node', [EkfNodeConfig, FilterConfig], **options)
@@ -65,15 +65,14 @@ class EkfNode(LocalizationNode):
     def _begin(self) -> None:
         self._config = self.settings(EkfNodeConfig)
         self.filter = PoseFilter(self.settings(FilterConfig))
-        self._broadcast = Broadcast()
         self._path: deque[geometry.PoseStamped] = deque(maxlen=PATH_LENGTH)
         self._path_ns = 0
         self._paused = False
         self._frames = self._config.odom_frame, self._config.base_frame
-        self._told: tuple[Level | None, str, float] = None, '', 0.0
-        self._last_moved = 0, 0.0
+        self._published_state: tuple[Level | None, str, float] = None, '', 0.0
+        self._last_change = 0, 0.0
         self._published_s = 0.0
-        self._sure: State | None = None
+        self._reliable: State | None = None
 
     def setup(self) -> None:
         self._begin()
@@ -83,8 +82,12 @@ class EkfNode(LocalizationNode):
         self.discovery = Discovery(self, _ODOM, [Odometry], ['odom'], self._subscribe_odometry)
         pose = geometry.PoseWithCovarianceStamped
         self.subscribe(pose, _IMAGE_POSE, self._receive_pose, sensor_qos(20))
-        turned = geometry.QuaternionStamped
-        self.subscribe(turned, 'sfa/turned', self._receive_turned, sensor_qos(20))
+        self.subscribe(
+            geometry.QuaternionStamped,
+            'sfa/turned',
+            lambda message: self.filter.add_turned(*convert.read_turned(message)),
+            sensor_qos(20),
+        )
         self.subscribe(String, 'sfa/rig', self._receive_rig, latched_qos())
         for topic in ('initialpose', '~/set_pose'):
             self.subscribe(pose, topic, self._set_pose, QoSProfile(depth=1))
@@ -92,7 +95,7 @@ class EkfNode(LocalizationNode):
         self.service(SetBool, '~/pause', self._pause)
         self.every(_WATCH_PERIOD_S, self._publish_state)
         self.every(SAVE_PERIOD_S, self._save_pose)
-        # Looped playback steps simulated time back; stamps alone would show it only later.
+        # A bag played in a loop steps simulated time back, before the stamps of messages do.
         back = Duration(nanoseconds=_BACKWARD_JUMP_NS)
         threshold = JumpThreshold(min_forward=None, min_backward=back, on_clock_change=False)
         self._jumps = self.get_clock().create_jump_callback(
@@ -144,8 +147,8 @@ class EkfNode(LocalizationNode):
         if reason:
             raise MessageError(reason)
         now_s = steady_s()
-        if self.monitor(_ODOM).waited_s > _PILED_S > now_s - self._published_s:
-            return  # it has piled up: fused, but not published each
+        if self.monitors[_ODOM].waited_s > _BACKLOG_S > now_s - self._published_s:
+            return
         self._published_s = now_s
         state = self.filter.at(stamp_ns)
         if state is not None:
@@ -156,8 +159,7 @@ class EkfNode(LocalizationNode):
     def _receive_pose(self, message: geometry.PoseWithCovarianceStamped) -> None:
         stamp_ns, pose, covariance = self._read_in_map(message)
         if self._paused:
-            # The estimate goes on by odometry: ekf/pose as well as ekf/odometry and /tf.
-            self._publish_pose(stamp_ns)
+            self._publish_pose(stamp_ns)  # by odometry alone, as ekf/odometry and /tf
             raise MessageError('paused')
         if covariance.any() and not covariance[2].any():
             covariance[2, 2] = math.inf  # a source without heading leaves its variance 0
@@ -166,9 +168,6 @@ class EkfNode(LocalizationNode):
         self._publish_pose(stamp_ns)
         if not update.accepted:
             raise MessageError(update.reason)
-
-    def _receive_turned(self, message: geometry.QuaternionStamped) -> None:
-        self.filter.add_turned(*convert.read_turned(message))
 
     def _receive_rig(self, message: String) -> None:
         rig, correlation = convert.read_rig(message)
@@ -213,30 +212,31 @@ class EkfNode(LocalizationNode):
         self._forget()
 
     def _restore_pose(self) -> None:
-        """Begin at the pose of before the restart: a hypothesis, which images confirm or not."""
-        path, given = self._config.pose_file, self.settings(FilterConfig).initial_pose
-        saved = load_pose(FilePath(path), self._config.map_frame) if path and not given else None
+        """Begin with the pose before the restart as a hypothesis."""
+        path = self._config.pose_file
+        if not path or self.settings(FilterConfig).initial_pose:
+            return
+        saved = load_pose(FilePath(path), self._config.map_frame)
         if saved is not None:
             self.filter.set_pose(saved.stamp_ns, saved.pose, saved.moved())
             x, y, yaw = saved.pose
             self.get_logger().info(f'{path}: looking first at {x:.2f}, {y:.2f}, {yaw:.2f} rad')
 
     def _save_pose(self) -> None:
-        """Write the last sure pose, if it is new."""
-        state, self._sure = self._sure, None
+        """Write the last reliable pose, if it is new."""
+        state, self._reliable = self._reliable, None
         if state is not None and self._config.pose_file:
-            frame = self._config.map_frame
-            saved = SavedPose(state.stamp_ns, frame, state.pose, state.pose_covariance)
+            pose = state.pose, state.pose_covariance
+            saved = SavedPose(state.stamp_ns, self._config.map_frame, *pose)
             save_pose(FilePath(self._config.pose_file), saved)
 
     def defect(self, name: str, error: Exception) -> None:
-        """What failed inside may fail at every message from now on: the filter starts anew."""
+        """Start anew after an internal error: the filter's state may cause it at every message."""
         super().defect(name, error)
         self._forget()
 
     def _forget(self) -> None:
         self.filter.reset()
-        self._broadcast.reset()
         self._path.clear()
 
     # Outputs.
@@ -247,18 +247,23 @@ class EkfNode(LocalizationNode):
         self._odometry.publish(convert.to_odometry(*pose, *twist, state.stamp_ns, frames))
 
     def _publish_transform(self, state: State, odom: Pose) -> None:
-        """Publish map -> odom at a stamp of odometry; on /tf also for transform_tolerance after."""
+        """Publish map -> odom at odometry's stamp; on /tf also transform_tolerance later.
+
+        A lookup of the present needs a transform from the future.
+        """
         frames, stamp_ns = (self._config.map_frame, self._frames[0]), state.stamp_ns
         map_to_odom = compose(state.pose, invert(np.array(odom)))
-        self._transform.publish(convert.to_transform(map_to_odom, stamp_ns, frames))
+        transforms = [convert.to_transform(map_to_odom, stamp_ns, frames)]
+        self._transform.publish(transforms[0])
         if self._tf is not None:
             ahead_ns = round(self._config.transform_tolerance * 1e9)
-            dated = self._broadcast.add(stamp_ns, map_to_odom, ahead_ns)
-            transforms = [convert.to_transform(pose, at_ns, frames) for at_ns, pose in dated]
+            if ahead_ns:
+                later_ns = stamp_ns + ahead_ns + _OFF_GRID_NS
+                transforms.append(convert.to_transform(map_to_odom, later_ns, frames))
             self._tf.publish(TFMessage(transforms=transforms))
 
     def _publish_verdict(self, update: Update) -> None:
-        """Publish what became of a measurement, at its stamp: its d2, and the gate's threshold."""
+        """Publish whether a measurement was accepted: its d2, and the gate's threshold."""
         level = _OK if update.accepted else _WARN
         values = {'accepted': str(update.accepted).lower()}
         for name, value in (('d2', update.d2), ('threshold', update.threshold)):
@@ -283,57 +288,57 @@ class EkfNode(LocalizationNode):
             self._trail.publish(Path(header=self._path[-1].header, poses=list(self._path)))
 
     def status(self) -> Status:
-        """The filter's status, and what the wall clock adds: inputs that do not arrive."""
-        status, added = self.filter.status, []
+        """The filter's status, with the reasons that the wall clock gives, as silent inputs."""
+        status, reasons = self.filter.status, []
         by_now, running_s = self._by_now(), steady_s() - self._configured_s
         timeout_s = self._config.silence_timeout
         for topic, limit in ((_ODOM, timeout_s), (_IMAGE_POSE, IMAGES_SILENCE * timeout_s)):
-            silent, name = self.monitor(topic).silent_for_s(), self.full_name(topic)
+            silent, name = self.monitors[topic].silent_for_s(), self.full_name(topic)
             if min(silent, running_s) > limit and not self.count_publishers(name):
-                added.append(f'nobody publishes on {name}')
+                reasons.append(f'nobody publishes on {name}')
             elif limit < silent < math.inf:
-                added.append(f'nothing on {name} for {silent:.0f} s')
+                reasons.append(f'nothing on {name} for {silent:.0f} s')
         if self._paused:
-            added.append('paused: images are not fused')
+            reasons.append('paused: images are not fused')
         lost, behind_s = [], self._behind_s()
         if behind_s > timeout_s:
-            added.append(f'behind by {behind_s:.1f} s: this computer is too busy')
-            self.get_logger().warning(added[-1], throttle_duration_sec=_BEHIND_LOG_S)
-        elif by_now is not None and (added or status.level is Level.DEGRADED):
-            # The filter's time is that of its messages: by the wall clock it may be lost.
+            reasons.append(f'behind by {behind_s:.1f} s: this computer is too busy')
+            self.get_logger().warning(reasons[-1], throttle_duration_sec=_BEHIND_LOG_S)
+        elif by_now is not None and (reasons or status.level is Level.DEGRADED):
+            # The filter knows the stamps of messages only; by the wall clock it may be lost.
             lost = [f'{reason} by now' for reason in uncertainty(by_now, self.filter.config)]
-        return status.with_reasons(lost, added)
+        return status.with_reasons(lost, reasons)
 
     def _behind_s(self) -> float:
-        """How long the odometry waits for this node, s."""
-        odometry = self.monitor(_ODOM)
+        """How long the last odometry waited for this node, s."""
+        odometry = self.monitors[_ODOM]
         return odometry.waited_s if odometry.silent_for_s() < self._config.silence_timeout else 0.0
 
     def _by_now(self) -> State | None:
-        """The estimate; after a long silence, predicted to the present by the wall clock."""
+        """The estimate, predicted to the present by the wall clock after a long silence."""
         state = self.filter.state
         if state is None:
             return None
-        if state.stamp_ns != self._last_moved[0]:
-            self._last_moved = state.stamp_ns, steady_s()
-        silent_s = steady_s() - self._last_moved[1]
-        heard = self.monitor(_ODOM).received or self.monitor(_IMAGE_POSE).received
-        if not heard or silent_s <= self._config.silence_timeout:
+        if state.stamp_ns != self._last_change[0]:
+            self._last_change = state.stamp_ns, steady_s()
+        silent_s = steady_s() - self._last_change[1]
+        received = self.monitors[_ODOM].received or self.monitors[_IMAGE_POSE].received
+        if not received or silent_s <= self._config.silence_timeout:
             return state
         return self.filter.at(state.stamp_ns + round(silent_s * 1e9))
 
     def _publish_state(self) -> None:
-        """Publish the state when its level changes at once, when its reasons do at most at 1 Hz."""
+        """Publish a change of the level at once, a change of the reasons at 1 Hz at most."""
         if not self.active:
             return
         status = self.status()
         if status.level is Level.LOCALISED:
-            self._sure = self.filter.state
+            self._reliable = self.filter.state
         text = ': '.join([status.level.name, '; '.join(status.reasons)]).rstrip(': ')
-        level, before, told_s = self._told
+        level, before, published_s = self._published_state
         changed, now_s = status.level is not level, steady_s()
-        if changed or (text != before and now_s > told_s + _REPEAT_STATE_S):
-            self._told = status.level, text, now_s
+        if changed or (text != before and now_s > published_s + _REPEAT_STATE_S):
+            self._published_state = status.level, text, now_s
             self._state.publish(String(data=text))
         if changed:
             self.get_logger().info(text)

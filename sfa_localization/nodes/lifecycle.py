@@ -9,7 +9,6 @@ releases what else it holds in `teardown`, and reports its state in `health`.
 from __future__ import annotations
 
 import signal
-import time
 import traceback
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -19,7 +18,7 @@ from typing import Any, TypeVar, cast
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -38,7 +37,8 @@ from sfa_localization.nodes.settings import NodeConfig
 _PACKAGE = 'sfa_localization'
 DIAGNOSTICS_PERIOD_S = 1.0
 """Time between messages on /diagnostics: diagnostic_aggregator expects about one a second."""
-_WAKE_PERIOD_S = 0.5  # of a timer that lets the executor notice a signal
+_WAKE_PERIOD_S = 0.5  # a signal just before the executor waits does not always wake it
+_QOS_PARAMETERS = QoSOverridingOptions.with_default_policies()
 S = TypeVar('S', bound=Settings)
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -97,10 +97,6 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         """The values in force."""
         return cast(S, self._settings[kind])
 
-    def monitor(self, name: str) -> Monitor:
-        """The counts of one input, made at its first use."""
-        return self.monitors[name]
-
     def diagnostic(
         self, part: str, level: Any, text: str, values: dict[str, str], stamp: Any
     ) -> DiagnosticArray:
@@ -111,12 +107,9 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         return DiagnosticArray(header=Header(stamp=stamp), status=[status])
 
     def publisher(self, kind: Any, topic: str, qos: QoSProfile | int = 10) -> Any:
-        """A publisher that is silent until activation; parameters can override its QoS.
-
-        A number is the depth of a reliable one.
-        """
+        """A publisher that is silent until activation. A number is the depth of a reliable one."""
         publisher = self.create_lifecycle_publisher(
-            kind, topic, qos, qos_overriding_options=QoSOverridingOptions.with_default_policies()
+            kind, topic, qos, qos_overriding_options=_QOS_PARAMETERS
         )
         self._entities[publisher] = self.destroy_lifecycle_publisher
         return publisher
@@ -136,42 +129,34 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         """
         latched = qos.durability is DurabilityPolicy.TRANSIENT_LOCAL
         self.require_input(topic, substitute)
-        receive, monitor = self.receiver(topic, callback, latched), self.monitor(topic)
 
-        def take(message: Any, info: dict[str, int]) -> None:
-            received_ns = info['received_timestamp']  # 0 where the middleware has none
-            wait_ns = time.time_ns() - received_ns if received_ns > 0 else 0
-            monitor.waited_s = max(wait_ns, 0) * 1e-9
-            receive(message)
+        def receive(message: Any, info: dict[str, int]) -> None:
+            if self.active or latched:
+                self.take(topic, callback, message, info['received_timestamp'])
 
         subscription = self.create_subscription(
             kind,
             substitute or topic,
-            cast(Any, take),
+            cast(Any, receive),
             qos,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            qos_overriding_options=_QOS_PARAMETERS,
         )
         self._entities[subscription] = self.destroy_subscription
         return subscription
 
     def unsubscribe(self, subscription: Any) -> None:
-        """End a subscription; None is none."""
+        """End a subscription, unless it is None."""
         if subscription is not None:
             self._entities.pop(subscription)(subscription)
 
-    def receiver(
-        self, topic: str, callback: Callable[[Any], None], while_inactive: bool = False
-    ) -> Callable[[Any], None]:
-        """A callback that counts its messages, and their latency, under `topic`."""
-        monitor = self.monitor(topic)
-
-        def receive(message: Any) -> None:
-            if self.active or while_inactive:
-                monitor.receive()
-                if self.attempt(topic, callback, message):
-                    monitor.use()
-
-        return receive
+    def take(
+        self, topic: str, callback: Callable[[Any], None], message: Any, received_ns: int = 0
+    ) -> None:
+        """Call with a message; count it, and whether it was used, under `topic`."""
+        monitor = self.monitors[topic]
+        monitor.receive(received_ns)
+        if self.attempt(topic, callback, message):
+            monitor.use()
 
     def full_name(self, topic: str) -> str:
         """The full name of an input after remapping; of another name, the name itself."""
@@ -191,13 +176,9 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         A remap of the whole name comes first.
         """
         base, _, transport = topic.rpartition('/')
-        resolved = self.resolve_topic_name(base)
-        remapped = self.resolve_topic_name(topic) != self.resolve_topic_name(
-            topic, only_expand=True
-        )
-        if remapped or resolved == self.resolve_topic_name(base, only_expand=True):
-            return topic
-        return f'{resolved}/{transport}'
+        full, resolved = map(self.resolve_topic_name, (topic, base))
+        plain = [self.resolve_topic_name(name, only_expand=True) for name in (topic, base)]
+        return topic if full != plain[0] or resolved == plain[1] else f'{resolved}/{transport}'
 
     def service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
         """A service with the fields success and message, which tells why `callback` failed."""
@@ -238,7 +219,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
         Returns how often this reason has occurred.
         """
-        count = self.monitor(topic).refused.add(reason)
+        count = self.monitors[topic].refused.add(reason)
         if count == 1 or count % 1000 == 0:
             line = f'{self.full_name(topic)}: {short_line(reason)} ({count} so far)'
             self.get_logger().warning(line)
@@ -305,48 +286,40 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         if not self.active:
             return
         level, text, values = self.health()
-        problem = self._time_problem()
-        if problem:
+        stamp, is_simulated = self.get_clock().now(), self.get_parameter('use_sim_time').value
+        patient = steady_s() < self._configured_s + PATIENCE_S
+        if is_simulated and not stamp.nanoseconds and not patient:
+            problem = 'use_sim_time is true, but there is no time on /clock: play bags with --clock'
             self.refuse('/clock', problem)
             level, text = max(level, DiagnosticStatus.WARN), f'{problem}; {text}'
         for topic, monitor in self.monitors.items():
             values.update(monitor.values(f'{self.full_name(topic)}: '))
-        now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(self.diagnostic('status', level, text, values, now))
-
-    def _time_problem(self) -> str:
-        """The reason if simulated time is asked for and does not come."""
-        simulated = self.get_parameter('use_sim_time').value
-        waiting = steady_s() < self._configured_s + PATIENCE_S
-        if waiting or not simulated or self.get_clock().now().nanoseconds:
-            return ''
-        return 'use_sim_time is true, but there is no time on /clock: play bags with --clock'
+        message = self.diagnostic('status', level, text, values, stamp.to_msg())
+        self._diagnostics.publish(message)
 
 
 def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
     """Run a node until SIGINT or SIGTERM; return the exit code of its process.
 
-    Ignores signals at the end: to be called by the main thread of a process that then ends.
+    The process must end afterwards, because it ignores signals then.
     """
     node = None
+    logger = rclpy.logging.get_logger(_PACKAGE)
     try:
         _initialize(words)
         node = make()
         parameters.warn_of_arguments(node, words)
         if not node.start():
             return entry.CANNOT_START if rclpy.ok() else 0
-        # A signal just before the executor waits does not always wake it.
-        clock = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(_WAKE_PERIOD_S, lambda: None, clock=clock)
         with one_core():
             _spin(node)
-    except ExternalShutdownException:
-        return 0
-    except Exception as error:
-        if node is not None and not rclpy.ok():
+    except LocalizationError as error:
+        logger.fatal(str(error))
+        return entry.CANNOT_START
+    except Exception:
+        if not rclpy.ok():
             return 0  # after a signal ROS cannot be used any more
-        text = str(error) if isinstance(error, LocalizationError) else traceback.format_exc()
-        rclpy.logging.get_logger(_PACKAGE).fatal(text)
+        logger.fatal(traceback.format_exc())
         return entry.DIED if node is not None and node.active else entry.CANNOT_START
     finally:
         if node is not None:
@@ -379,9 +352,11 @@ def _spin(node: LocalizationNode) -> None:
 
     rclpy raises RuntimeError for a transition that does not fit, ValueError for a negative clock.
     """
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
     while rclpy.ok():
         try:
-            rclpy.spin(node)
+            executor.spin_once(_WAKE_PERIOD_S)
         except (RuntimeError, ValueError) as error:
             if rclpy.ok():
                 node.refuse('rclpy', str(error))

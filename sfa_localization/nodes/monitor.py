@@ -8,6 +8,8 @@ import math
 import time
 from collections import deque
 
+import numpy as np
+
 from sfa_localization.data.rejections import RejectionCounter
 
 _WINDOW = 500
@@ -19,8 +21,9 @@ def steady_s() -> float:
 
 
 class Monitor:
-    """Counts of messages received, used, and rejected by reason; latency of the last messages, and
-    how long, `waited_s`, the last one had waited to be taken.
+    """Counts of messages received, used, and rejected by reason; latencies of the last messages.
+
+    `waited_s` is how long the last message had waited in the queue of its subscription.
     """
 
     def __init__(self) -> None:
@@ -30,9 +33,10 @@ class Monitor:
         self._arrivals_s: deque[float] = deque(maxlen=_WINDOW)
         self._latencies_s: deque[float] = deque(maxlen=_WINDOW)
 
-    def receive(self) -> None:
-        """Count a message that has arrived."""
+    def receive(self, received_ns: int = 0) -> None:
+        """Count a message; `received_ns` is when the middleware received it, 0 if unknown."""
         self.received += 1
+        self.waited_s = max(time.time_ns() - received_ns, 0) * 1e-9 if received_ns > 0 else 0.0
         self._arrivals_s.append(steady_s())
 
     def use(self) -> None:
@@ -50,16 +54,14 @@ class Monitor:
         """
         span_s = steady_s() - self._arrivals_s[0] if self._arrivals_s else 0.0
         rate_hz = max(len(self._arrivals_s) - 1, 0) / max(span_s, 1e-9)
-        taken_ms = sorted(1e3 * latency_s for latency_s in self._latencies_s) or [0.0]
-        p50, p99 = (taken_ms[round(part * (len(taken_ms) - 1))] for part in (0.5, 0.99))
+        p50_s, p99_s = np.percentile(self._latencies_s or [0.0], [50, 99])
         texts = {
             f'{prefix}received': str(self.received),
             f'{prefix}used': str(self.used),
             f'{prefix}rate [Hz]': f'{rate_hz:.1f}',
-            f'{prefix}latency p50 [ms]': f'{p50:.2f}',
-            f'{prefix}latency p99 [ms]': f'{p99:.2f}',
+            f'{prefix}latency p50 [ms]': f'{1e3 * p50_s:.2f}',
+            f'{prefix}latency p99 [ms]': f'{1e3 * p99_s:.2f}',
         }
         # Copied, because the thread of a feed may add to it meanwhile.
         refused = sorted(dict(self.refused).items())
-        texts.update({f'{prefix}refused: {why}': str(n) for why, n in refused})
-        return texts
+        return texts | {f'{prefix}refused: {reason}': str(n) for reason, n in refused}

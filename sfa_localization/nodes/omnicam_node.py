@@ -2,13 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS 2 node: images of an omnidirectional camera in, panoramas out, with the images' stamps.
 
-Images come from a topic, or straight from a device, a video file or a folder. Nothing is done
-without a subscriber, and of images that come too fast only the newest is used.
+Images come from a topic, a device, a video file or a folder. The node works only while somebody
+subscribes, and uses only the newest of images that come too fast.
 """
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import Any, cast
 
@@ -18,7 +17,7 @@ from sensor_msgs.msg import CompressedImage, Imu
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import String
 
-from sfa_localization.camera.capture import Feed, FeedStatus, opener
+from sfa_localization.camera.capture import Feed, opener
 from sfa_localization.camera.leveling import leveled, tilts_at
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, CaptureConfig, PanoramaConfig
@@ -34,10 +33,10 @@ from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import OmnicamNodeConfig
 
-_DEMAND_PERIOD_S = 0.1  # between looks for subscribers: a new one waits no longer for images
-_LITTLE_VISIBLE = 0.5  # share of the panorama below which a warning is given
-_IMU, _ORIENTATIONS = 'imu/data', 500  # of these the last are kept: a second or more
-_JPEG_QUALITY = 90  # percent; no visible artifacts, about a tenth of the raw size
+_DEMAND_PERIOD_S = 0.1  # between checks for subscribers: a new one waits no longer for images
+_LITTLE_VISIBLE = 0.5  # a smaller visible share of the panorama gives a warning
+_IMU, _ORIENTATIONS = 'imu/data', 500  # the number kept: those of a second or more
+_JPEG_QUALITY = 90  # percent: no visible artifacts, a tenth of the raw size
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -53,13 +52,15 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._config = self.settings(OmnicamNodeConfig)
         self._unwrapper = self._new_unwrapper(self._settings)
         self._size: tuple[int, int] | None = None
-        self._listening_since_s: float | None = None
+        self._begin()
+
+    def _begin(self) -> None:
         self._feed: Feed | None = None
-        self._arrival: Any = None
+        self._subscription: Any = None
+        self._listening_since_s: float | None = None
         self._newest: deque[tuple[int, Image]] = deque(maxlen=1)
         self._tilts: deque[tuple[int, float, float]] = deque(maxlen=_ORIENTATIONS)
-        self._level, self._newer_s = True, 0.0
-        self._subscription: Any = None
+        self._is_level = True
 
     # Life cycle.
 
@@ -75,22 +76,19 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._input = 'image_raw' if raw else self.following('image_raw/compressed')
         self.discovery: Discovery | None = None
         self._substitute = ''
-        if self.settings(CaptureConfig).source == 'topic':
+        capture = self.settings(CaptureConfig)
+        if capture.source == 'topic':
             self.require_input(self._input)
             self._kinds = [ImageMessage, CompressedImage][:: 1 if raw else -1]
             arguments = 'image', 'panorama'
             self.discovery = Discovery(self, self._input, self._kinds, arguments, self._take)
         else:
-            self._set_up_feed(self.settings(CaptureConfig))
+            self._input = capture.source_path
+            self._arrival = self.create_guard_condition(self._arrived)
+            self._feed = Feed(opener(capture), self._deliver, capture, self._reject, self._wanted)
         if self.settings(CameraConfig).level_by_imu:
             self.subscribe(Imu, _IMU, self._take_orientation, lifecycle.sensor_qos(20))
         self.every(_DEMAND_PERIOD_S, self._follow_demand)
-
-    def _set_up_feed(self, source: CaptureConfig) -> None:
-        self._input = source.source_path
-        receive = self.receiver(self._input, self._use_newest)
-        self._arrival = self.create_guard_condition(lambda: receive(None))
-        self._feed = Feed(opener(source), self._deliver, source, self._reject, self._wanted)
 
     def started(self) -> None:
         self._info.publish(convert.to_info(self.settings(PanoramaConfig)))
@@ -102,12 +100,9 @@ class OmnicamNode(lifecycle.LocalizationNode):
         if self._feed is not None:
             self._feed.stop()
             self.destroy_guard_condition(self._arrival)
-        self._feed = self._arrival = self._listening_since_s = self._subscription = None
-        self._newest.clear()
-        self._tilts.clear()
-        self._level, self._newer_s = True, 0.0
+        self._begin()
 
-    # Demand: without subscribers there is no subscription, and files wait.
+    # Without subscribers to panoramas no images are taken.
 
     def _wanted(self) -> bool:
         outputs = (self._panoramas, self._compressed)
@@ -126,7 +121,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
             )
 
     def _take(self, topic: str) -> None:
-        """Take images from another topic than the expected one, or again from that."""
+        """Take images from a substitute for the input's topic, or again from that itself."""
         self._stop_listening()
         self.require_input(self._input, topic)
         self._substitute = topic
@@ -142,19 +137,22 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._publish(image, stamp_ns, self._config.frame_id or message.header.frame_id)
 
     def _deliver(self, image: Image) -> None:
-        """Called in the feed's thread: keep the newest image only, and wake the executor."""
+        """Keep the newest image, and wake the executor; called by the feed's thread."""
         self._newest.append((self.get_clock().now().nanoseconds, image))
         self._arrival.trigger()
 
     def _reject(self, reason: str) -> None:
         self.refuse(self._input, reason)
 
-    def _use_newest(self, _: None) -> None:
+    def _arrived(self) -> None:
         if self._newest and self._wanted():
-            stamp_ns, image = self._newest.pop()
-            if stamp_ns <= 0:
-                raise MessageError('the clock has not started')
-            self._publish(image, stamp_ns, self._config.frame_id)
+            self.take(self._input, self._use_delivered, self._newest.pop())
+
+    def _use_delivered(self, delivered: tuple[int, Image]) -> None:
+        stamp_ns, image = delivered
+        if stamp_ns <= 0:
+            raise MessageError('the clock has not started')
+        self._publish(image, stamp_ns, self._config.frame_id)
 
     def _take_orientation(self, message: Imu) -> None:
         stamp_ns, tilt = read_stamp(message.header.stamp), read_tilt(message)
@@ -163,17 +161,15 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._tilts.append((stamp_ns, *tilt))
 
     def _leveled(self, panorama: Image, stamp_ns: int) -> Image:
-        """The panorama by the orientation near its stamp; as it is where there is none."""
+        """The panorama, leveled by an orientation near its stamp if there is one."""
         if not self.settings(CameraConfig).level_by_imu:
             return panorama
-        known = np.array([stamp for stamp, *_ in self._tilts], np.int64)
+        stamps_ns = np.array([stamp for stamp, *_ in self._tilts], np.int64)
         tilts = np.reshape([tilt for _, *tilt in self._tilts], (-1, 2))
-        (tilt,) = tilts_at(np.array([stamp_ns]), known, tilts)
-        self._level = bool(np.isfinite(tilt).all())
-        if not self._level:
-            self._newer_s = (stamp_ns - known[-1]) * 1e-9 if len(known) else math.inf
-            return panorama
-        return leveled(panorama, tilt, self.settings(PanoramaConfig).sphere)
+        (tilt,) = tilts_at(np.array([stamp_ns]), stamps_ns, tilts)
+        self._is_level = bool(np.isfinite(tilt).all())
+        sphere = self.settings(PanoramaConfig).sphere
+        return leveled(panorama, tilt, sphere) if self._is_level else panorama
 
     def _publish(self, image: Image, stamp_ns: int, frame: str) -> None:
         panorama, frame = self._leveled(self._unwrapper(image), stamp_ns), frame or 'omnicam'
@@ -188,7 +184,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
     # Parameters that change while running.
 
     def check(self, settings: Current) -> None:
-        """Raises LocalizationError for a mask, sector, mount or elevation without a panorama."""
+        """Raises LocalizationError for a mask, sector, mount or elevation that hides all."""
         if any(settings[kind] != self._settings[kind] for kind in (CameraConfig, PanoramaConfig)):
             self._build_tables(self._new_unwrapper(settings))
 
@@ -206,7 +202,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         return Unwrapper(cast(CameraConfig, camera), cast(PanoramaConfig, panorama))
 
     def _build_tables(self, unwrapper: Unwrapper) -> None:
-        """Build the tables for the size of image that is, or will be, in use, if it is known."""
+        """Build the tables for the images' size, if an image or the calibration gives it."""
         lens = unwrapper.calibration if unwrapper.model else None
         size = self._size or (lens and (lens.image_height, lens.image_width)) or (0, 0)
         if lens and 0 not in size:
@@ -225,18 +221,24 @@ class OmnicamNode(lifecycle.LocalizationNode):
 
     def _judge_source(self, details: dict[str, str]) -> tuple[int, str]:
         if self._feed is not None:
-            return _judge_feed(self._feed.status(), details)
+            status = self._feed.status()
+            details['source'], details['source lost'] = status.state, str(status.lost)
+            if status.state == 'lost':
+                return _ERROR, f'camera lost, will be opened again: {status.problem}'
+            if status.state == 'opening':
+                return _WARN, 'opening the camera'
+            return _OK, 'at the end of the images' if status.state == 'ended' else ''
         if self._listening_since_s is None:
             return _OK, 'idle: nobody listens to the panorama'
         listening_s = steady_s() - self._listening_since_s
-        silent_s = min(self.monitor(self._input).silent_for_s(), listening_s)
+        silent_s = min(self.monitors[self._input].silent_for_s(), listening_s)
         if silent_s > self.settings(CaptureConfig).silence_timeout:
             silent = f'no image on {self.full_name(self._input)} for {silent_s:.0f} s'
             return _ERROR, (self.discovery and self.discovery.hint) or silent
         return _OK, ''
 
     def _judge_images(self, details: dict[str, str]) -> tuple[int, str]:
-        frozen_s, monitor = self._frozen.frozen_for_s(), self.monitor(self._input)
+        frozen_s, monitor = self._frozen.frozen_for_s(), self.monitors[self._input]
         if frozen_s:
             return _WARN, f'the camera has repeated its last image for {frozen_s:.0f} s'
         if monitor.received and not monitor.used:
@@ -247,27 +249,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         details['panorama visible [%]'] = f'{100 * visible:.0f}'
         if visible < _LITTLE_VISIBLE:
             return _WARN, f'the camera sees only {100 * visible:.0f} % of the panorama'
-        return (
-            (_OK, '') if self._level else (_WARN, f'{self._why_not()}: panoramas are not leveled')
-        )
-
-    def _why_not(self) -> str:
-        """Why the last image had no orientation of the robot."""
-        heard, topic = self.monitor(_IMU), self.full_name(_IMU)
-        if heard.silent_for_s() > self.settings(CaptureConfig).silence_timeout:
-            return f'no message on {topic}'
-        if not heard.used:
-            return f'{topic}: {max(heard.refused, key=heard.refused.__getitem__)}'
-        side = 'after' if self._newer_s > 0 else 'before'
-        apart = f'{abs(self._newer_s):.2f} s {side} the last orientation on {topic}'
-        return f'the last image was stamped {apart}'
-
-
-def _judge_feed(status: FeedStatus, details: dict[str, str]) -> tuple[int, str]:
-    details['source'] = status.state
-    details['source lost'] = str(status.lost)
-    if status.state == 'lost':
-        return _ERROR, f'camera lost, will be opened again: {status.problem}'
-    if status.state == 'opening':
-        return _WARN, 'opening the camera'
-    return _OK, 'at the end of the images' if status.state == 'ended' else ''
+        if not self._is_level:
+            topic = self.full_name(_IMU)
+            return _WARN, f'no orientation on {topic} near images: panoramas are not leveled'
+        return _OK, ''

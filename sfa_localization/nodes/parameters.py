@@ -51,14 +51,13 @@ def on_change(
 ) -> None:
     """Check changes of live parameters together, keep them in `current`, and hand them to `apply`.
 
-    A change that is out of range, or wrong beside the other parameters, or for which `check`
-    raises a LocalizationError, is rejected, with the reason in the answer to the request, and
-    nothing is applied.
+    Nothing is applied, and the answer gives the reason, if a value is out of range or contradicts
+    other parameters, or if `check` raises a LocalizationError.
     """
     fields = {item.name: item for kind in current for item in dataclasses.fields(kind)}
 
     def convert(changes: list[Parameter]) -> list[Parameter]:
-        return [typed(fields[c.name], c) if c.name in fields else c for c in changes]
+        return [_typed(fields[c.name], c) if c.name in fields else c for c in changes]
 
     def judge(changes: list[Parameter]) -> SetParametersResult:
         try:
@@ -73,7 +72,6 @@ def on_change(
             if current[kind] != settings:
                 apply(current[kind])
 
-    # One for all settings: rclpy would join the lists of several.
     node.add_pre_set_parameters_callback(convert)
     node.add_on_set_parameters_callback(judge)
     node.add_post_set_parameters_callback(accept)
@@ -87,17 +85,17 @@ def _changed(settings: S, changes: Sequence[Parameter]) -> S:
     )
 
 
-def typed(item: dataclasses.Field[Any], given: Parameter) -> Parameter:
-    """The parameter as one of its setting's type, where its value can be that.
+def _typed(item: dataclasses.Field[Any], given: Parameter) -> Parameter:
+    """A parameter with real numbers instead of integers if its setting has them.
 
-    ROS reads 3 as an integer, also for a real number, and an empty list has no type.
+    ROS reads 3 as an integer, and gives an empty list any type.
     """
-    value = given.value
+    value, numbers = given.value, (int, float)
     if isinstance(item.default, float) and type(value) is int:
         return Parameter(item.name, value=float(value))
-    entries = value if isinstance(value, (list, tuple, array.array)) else [value]
-    if isinstance(item.default, tuple) and all(type(entry) in (int, float) for entry in entries):
-        return Parameter(item.name, Parameter.Type.DOUBLE_ARRAY, [float(x) for x in entries])
+    is_list = isinstance(item.default, tuple) and isinstance(value, (list, tuple, array.array))
+    if is_list and all(type(entry) in numbers for entry in value):
+        return Parameter(item.name, Parameter.Type.DOUBLE_ARRAY, [float(x) for x in value])
     return given
 
 
@@ -133,28 +131,27 @@ def _declare_field(node: Node, item: dataclasses.Field[Any]) -> Any:
     given = node.get_parameter(item.name)
     if isinstance(item.default, tuple) and given.value is None:  # `[]` in a parameter file
         given = Parameter(item.name, value=[])
-    node.set_parameters([typed(item, given)])
-    return typed(item, given).value
+    node.set_parameters([_typed(item, given)])
+    return _typed(item, given).value
 
 
 def _descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
-    """Descriptor of one setting: description with unit, range, and whether it may change.
+    """Descriptor of one setting: type, description with unit, range, and whether it may change.
 
-    Lists, and what is bounded on one side, have no range in ROS; their Settings check them.
+    ROS has no range for lists, nor with one bound only; their Settings check them.
     """
     meta = item.metadata
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''
-    made = ParameterDescriptor(description=f'{meta["doc"]}{unit}', read_only=not meta['live'])
-    made.type = typed(item, Parameter(item.name, value=item.default)).type_.value
+    descriptor = ParameterDescriptor(description=f'{meta["doc"]}{unit}', read_only=not meta['live'])
+    descriptor.type = _typed(item, Parameter(item.name, value=item.default)).type_.value
     if meta['choices']:
-        made.additional_constraints = 'one of: ' + ', '.join(filter(None, meta['choices']))
+        descriptor.additional_constraints = 'one of: ' + ', '.join(filter(None, meta['choices']))
     low, high = meta['low'], meta['high']
     if low is None or high is None:
-        return made
+        return descriptor
     if isinstance(item.default, float):
-        made.floating_point_range = [
-            FloatingPointRange(from_value=float(low), to_value=float(high))
-        ]
+        bounds = FloatingPointRange(from_value=float(low), to_value=float(high))
+        descriptor.floating_point_range = [bounds]
     elif type(item.default) is int:
-        made.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
-    return made
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+    return descriptor

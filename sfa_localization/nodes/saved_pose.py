@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The last sure pose in a small file: where a robot that is switched on again looks first."""
+"""The last reliable pose in a small file: where a robot looks first after a restart."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.inputs import read_pose
 
 SAVE_PERIOD_S = 10.0
-"""Time between two writes: a robot loses that much of its way, and a flash card lives for years."""
+"""Time between two writes: rare enough for a flash card to last for years."""
 MOVED_STD_M, MOVED_YAW_STD = 0.5, 0.3
-"""m and rad that a robot may be moved by while it is off, as when it is pushed to its charger. What
-is more, the first images show: the pose is a hypothesis, and they overrule it."""
-_LARGEST_FILE = 65536  # bytes, many times what is written
+"""m and rad by which a robot may be moved while it is off, as when it is pushed to its charger. The
+pose is a hypothesis: images overrule it where the robot was moved farther."""
+_LARGEST_FILE = 65536  # bytes, many times the size of a pose
 _VERSION = 1
 
 
@@ -33,14 +33,15 @@ class SavedPose(NamedTuple):
     covariance: Array
 
     def moved(self) -> Array:
-        """The covariance (3, 3) after the robot was off."""
+        """The covariance (3, 3) when the robot is switched on again."""
         added = np.diag(np.square([MOVED_STD_M, MOVED_STD_M, MOVED_YAW_STD]))
         return np.asarray(self.covariance + added)
 
 
 def save_pose(path: Path, saved: SavedPose) -> None:
-    """Write the file, completely or not at all. Raises LocalizationError, also where a file holds
-    something else than a pose: it stays.
+    """Write the file, completely or not at all.
+
+    Raises LocalizationError; a file that holds something else than a pose is not written over.
     """
     _content(path)
     content = {'version': _VERSION, **saved._asdict()}
@@ -49,7 +50,7 @@ def save_pose(path: Path, saved: SavedPose) -> None:
 
 
 def load_pose(path: Path, frame: str) -> SavedPose | None:
-    """What was saved, checked; None where there is no file yet. Raises DataError."""
+    """Read and check the file; None if there is none yet. Raises DataError."""
     content = _content(path)
     if content is None:
         return None
@@ -63,7 +64,7 @@ def load_pose(path: Path, frame: str) -> SavedPose | None:
 
 
 def _content(path: Path) -> Any:
-    """What a file holds, of any version; None where it is empty or missing. Raises DataError."""
+    """A file's content, of any version; None if it is empty or missing. Raises DataError."""
     try:
         text = read_regular(path, _LARGEST_FILE)
         content = json.loads(text) if text else None

@@ -59,7 +59,7 @@ class SfaNode(LocalizationNode):
         compressed = self._config.image_transport == 'compressed'
         self._topic = self.following('panorama/compressed') if compressed else 'panorama'
         kinds = [CompressedImage, Image] if compressed else [Image, CompressedImage]
-        # Depth 1: when images come faster than they are located, the oldest is dropped.
+        # With depth 1 the oldest image is dropped when images come faster than they are located.
         self.subscribe(kinds[0], self._topic, self._receive, sensor_qos(1))
         self.discovery = Discovery(self, self._topic, kinds, ['panorama'])
 
@@ -69,22 +69,17 @@ class SfaNode(LocalizationNode):
     def teardown(self) -> None:
         self._observer = None
 
-    # The model.
-
     def _load(self, path: str) -> PlaceModel:
-        """Read a model. Raises LocalizationError where it is missing or damaged."""
+        """Load a model. Raises LocalizationError if it is missing or damaged."""
         if not path:
             raise ConfigError(
                 "parameter 'model' is empty: name the file that the train command wrote "
                 '(--ros-args -p model:=MODEL.npz)'
             )
-        model = PlaceModel.load(Path(path))
-        size = model.panorama
-        self.get_logger().info(f'{path}: panoramas of {size.width}x{size.height}')
-        return model
+        return PlaceModel.load(Path(path))
 
     def check(self, settings: Current) -> None:
-        """Raises LocalizationError for a model that cannot be loaded, in any state."""
+        """Load a new model, in any state. Raises LocalizationError if that fails."""
         path = cast(SfaNodeConfig, settings[SfaNodeConfig]).model
         if path != self._config.model:
             self._loaded = self._load(path)
@@ -99,7 +94,7 @@ class SfaNode(LocalizationNode):
             self._loaded = None
 
     def _use(self, model: PlaceModel) -> None:
-        """Go on with another model; an unconfigured node reads its own when it is configured."""
+        """Switch to another model; an unconfigured node loads its model when configured."""
         if self._observer is not None:
             self._observer.use(model)
             self._publish_rig()
@@ -121,7 +116,7 @@ class SfaNode(LocalizationNode):
         self._declared = convert.read_info(message)
 
     def _declared_problem(self, expected: PanoramaConfig) -> str:
-        """How the panoramas are declared to differ from those of training; '' when they do not."""
+        """The differences between declared panoramas and those of training; '' without any."""
         differences = expected.differences(self._declared) if self._declared is not None else ''
         if not differences:
             return ''
@@ -132,8 +127,7 @@ class SfaNode(LocalizationNode):
 
     def _receive(self, message: Image | CompressedImage) -> None:
         assert self._observer is not None
-        problem = self._declared_problem(self._observer.model.panorama)
-        if problem:
+        if problem := self._declared_problem(self._observer.model.panorama):
             raise MessageError(problem)
         self._last = observation = self._observer.observe(*convert.read_image(message))
         self._publish(observation)
@@ -141,7 +135,7 @@ class SfaNode(LocalizationNode):
             raise MessageError(observation.problem)
 
     def _publish(self, seen: Observation) -> None:
-        """An unusable image gets no pose without covariance: it would look like a usable one."""
+        """Publish an observation; of an unusable image, the pose with its large covariance only."""
         frame, slow, stamp_ns = self._config.map_frame, seen.slow_features, seen.stamp_ns
         if np.all(np.isfinite(slow)):
             self._features.publish(convert.to_array(slow, 'slow features'))
@@ -161,15 +155,14 @@ class SfaNode(LocalizationNode):
             explained, factor = self._last.explained, self._observer.slow_error_factor
             values['explained'] = f'{100 * explained:.0f} %'
             values['slow feature errors'] = f'{factor:.1f} times as in training'
-        monitor, topic = self.monitor(self._topic), self.full_name(self._topic)
+        monitor, topic = self.monitors[self._topic], self.full_name(self._topic)
         silent = monitor.silent_for_s()
         if math.isinf(silent):
             return _WARN, self.discovery.hint or f'waiting for images on {topic}', values
         if silent > self._config.silence_timeout:
             return _ERROR, f'no image on {topic} for {silent:.0f} s', values
-        declared = self._declared_problem(self._observer.model.panorama)
-        if declared:
-            return _ERROR, declared, values
+        if problem := self._declared_problem(self._observer.model.panorama):
+            return _ERROR, problem, values
         if monitor.used == 0:
             return _ERROR, 'no image has been usable', values
         if self._last is not None and self._last.problem:

@@ -83,7 +83,7 @@ class Chain:
             and listeners(self.nodes['omnicam_node'], PANORAMA) == 1
             and listeners(self.nodes['sfa_node'], SEEN) == 1
             and listeners(self.nodes['sfa_node'], 'sfa/turned') == 1
-            and ekf.monitor('sfa/rig').used > 0
+            and ekf.monitors['sfa/rig'].used > 0
         )
 
     def take(self, message):
@@ -146,7 +146,7 @@ class Chain:
 
 def done(node, topic):
     """Messages that a node has used, and all that it has finished."""
-    monitor = node.monitor(topic)
+    monitor = node.monitors[topic]
     return monitor.used, monitor.used + sum(dict(monitor.refused).values())
 
 
