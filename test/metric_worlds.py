@@ -27,7 +27,7 @@ class DriveWithTruth:
 
 
 def drive(twists, *, start=(0.0, 0.0, 0.0), bias=0.0, yaw_noise=0.0, speed_noise=0.0, seed=0):
-    """DriveWithTruth twists (T, 2) at 50 Hz; odometry adds a yaw-rate bias and white noise. 5 pictures/s."""
+    """Drive twists (T, 2) at 50 Hz; odometry adds a yaw-rate bias and white noise. 5 pictures/s."""
     rng = np.random.default_rng(seed)
     twists = np.asarray(twists, float)
     stamps = 1_000_000_000 + STEP_NS * np.arange(len(twists) + 1)

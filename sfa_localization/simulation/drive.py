@@ -58,7 +58,7 @@ SWAY = 0.25
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class SimulatedDrive:
     """A recorded drive: the truth in frame `world`, the measurements, the stamps of the images.
 
     A robot without a gyroscope has no `yaw_rate`.
@@ -81,7 +81,7 @@ def random_stream(config: SimulationConfig, stream: int, item: int = 0) -> np.ra
     return np.random.default_rng([config.seed, config.world, drive_index, stream, item])
 
 
-def drive(garden: Garden, config: SimulationConfig) -> Drive:
+def drive(garden: Garden, config: SimulationConfig) -> SimulatedDrive:
     """Plan the route of `config`, drive it from the dock and measure; no images are made."""
     lawn = Lawn(garden.half, garden.obstacles)
     plan = ROUTES[config.trajectory]
@@ -94,7 +94,7 @@ def drive(garden: Garden, config: SimulationConfig) -> Drive:
     poses = integrate(stamps, measured, _odometry_start(config))
     odometry = Odometry(stamps, poses, measured, variances)
     gyro = YawRate(stamps, measured[:, 1], variances[:, 1])
-    return Drive(truth, odometry, gyro, _image_stamps(stamps, twists, imaging, config))
+    return SimulatedDrive(truth, odometry, gyro, _image_stamps(stamps, twists, imaging, config))
 
 
 def _odometry_start(config: SimulationConfig) -> Array:
@@ -228,7 +228,7 @@ def lights(stamps_ns: Stamps, config: SimulationConfig) -> list[Light]:
 
 
 def render_images(
-    garden: Garden, drive: Drive, config: SimulationConfig, view: View
+    garden: Garden, drive: SimulatedDrive, config: SimulationConfig, view: View
 ) -> Iterator[Image]:
     """The noisy images of a drive in order, rendered ahead by a thread per core."""
     jobs = zip(drive.image_poses, lights(drive.image_stamps_ns, config), strict=True)
@@ -278,7 +278,7 @@ def simulate(
     out: Path,
     panorama: PanoramaConfig | None = None,
     progress: bool = False,
-) -> Drive:
+) -> SimulatedDrive:
     """Drive through the garden of `config` and `record` it. Returns what was recorded."""
     garden = Garden(config.world, config)
     driven = drive(garden, config)
@@ -287,7 +287,7 @@ def simulate(
 
 
 def record(
-    driven: Drive,
+    driven: SimulatedDrive,
     garden: Garden,
     config: SimulationConfig,
     out: Path,
@@ -311,7 +311,9 @@ def record(
         _write(bag, driven, shown, config)
 
 
-def _write(bag: BagWriter, drive: Drive, frames: Iterable[Image], config: SimulationConfig) -> None:
+def _write(
+    bag: BagWriter, drive: SimulatedDrive, frames: Iterable[Image], config: SimulationConfig
+) -> None:
     """Write all messages in the order of their stamps."""
     compressed = None if config.compression == 'none' else config.compression
     topic = '/panorama' if config.images == 'panorama' else '/image_raw'
