@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""How far the estimates are from the truth: the paper's protocol (section 4).
+"""How far the estimates are from the ground truth: the paper's protocol (section 4).
 
-The map is known up to a rotation and a translation. They are fitted on the estimates of a training
-drive and applied unchanged to the drive that is judged; the error is the Euclidean distance.
+Training determines the map up to a rotation and a translation. Both are fitted on the estimates of
+the training drives and applied unchanged to the test drive; the error is the Euclidean distance.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ from __future__ import annotations
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal, stats
 
 from sfa_localization.bags.drives import as_live, image_folder, read_drive
@@ -27,6 +26,7 @@ from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import (
     Array,
+    Mask,
     RigidTransform,
     align,
     compose,
@@ -34,15 +34,14 @@ from sfa_localization.data.geometry import (
     rotation,
     wrap_angle,
 )
-from sfa_localization.data.progress import progress_bar, progress_over
+from sfa_localization.data.progress import progress_over
 from sfa_localization.data.run import Count, Run, Stamps, Trajectory
 from sfa_localization.data.threads import one_core
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.inputs import OpenLoop
-from sfa_localization.fusion.motion import State
 from sfa_localization.fusion.odometry import COAST_S
-from sfa_localization.fusion.pose_filter import PoseFilter
-from sfa_localization.fusion.replay import Track
+from sfa_localization.fusion.pose_filter import PoseFilter, State
+from sfa_localization.fusion.replay import Track, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
@@ -53,15 +52,15 @@ from sfa_localization.training import Recipe
 Scores = dict[str, dict[str, Any]]
 _TRUTH_TOLERANCE_NS = 500_000_000
 WRONG_M = 1.0
-"""A LOCALISED robot that is farther off is wrong."""
+"""Position error from which a filter that says LOCALISED is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """A judged drive. `estimates` are in the truth's frame.
+    """A test drive with its errors. `estimates` are in the frame of the ground truth.
 
-    `features` (N, K) are those of the usable images, of which `estimates['sfa']` is.
-    `aligned_on` names the drives on which `transform`, from map to truth, was fitted.
+    `features` (N, K) belong to the usable images, as `estimates['sfa']` does. `transform` leads
+    from the map to the truth; `aligned_on` names the drives on which it was fitted.
     """
 
     truth: Trajectory
@@ -78,24 +77,24 @@ class Evaluation:
 
 
 @dataclass(frozen=True, slots=True)
-class _Drive:
-    """What model and filter make of a drive.
+class _Localized:
+    """A drive, localized by model and filter.
 
-    `tracks` holds 'sfa', the usable images, of which `features` (N, K) are; 'ekf', the filter at
-    each odometry message, and whether it was LOCALISED there, `sure` (T,); and 'smoothed', if
-    wanted. `counts` are those of messages, of observations, of what was fused, and of states.
+    `tracks` are in the map: 'sfa' of the usable images with `features` (N, K), 'ekf' of the filter
+    at each odometry message, and 'smoothed' on request. `localised` (T,) tells where the filter
+    said LOCALISED.
     """
 
     run: Run
     truth: Trajectory
     tracks: dict[str, Track]
     features: Array
-    sure: NDArray[np.bool_]
+    localised: Mask
     counts: dict[str, Any]
 
     @property
     def images(self) -> Trajectory:
-        """The usable images in the map."""
+        """Poses of the usable images in the map."""
         return self.tracks['sfa'].poses
 
 
@@ -112,66 +111,59 @@ def evaluate(
     smooth: bool = False,
     transform: RigidTransform | None = None,
 ) -> Evaluation:
-    """Judge a model on a drive with ground truth, by what sfa_node and ekf_node would publish.
+    """Compare with the ground truth of a drive what sfa_node and ekf_node would publish on it.
 
-    The transform to the truth is fitted on `align_bags`, training drives; without any, on the
-    drive itself; a known `transform`, of an earlier evaluation, is used as it is. `smooth` adds the
-    filter's estimates smoothed after the drive. Unusable images count as skipped observations.
-    Raises BagError or DataError, also without ground truth.
+    The transform from map to truth is fitted on `align_bags`, the training drives, or without any
+    on the test drive; a given `transform` is used as it is. `smooth` adds the filter's estimates
+    smoothed after the drive. Unusable images count as skipped observations. Raises BagError or
+    DataError, also without ground truth.
     """
     recipe = as_live(recipe or Recipe(), model.panorama)
-    given = [(one, Localizer(model, config, watch), _present(one, recipe)) for one in align_bags]
-    trained = [_driven(*one, progress) for one in given]
+    training_drives = [
+        _localized(path, Localizer(model, config, watch), _with_topics_of(path, recipe), progress)
+        for path in align_bags
+    ]
     kind = Smoother if smooth else PoseFilter
-    drive = _driven(bag, Localizer(model, config, watch, kind), recipe, progress)
-    bags = ', '.join(map(str, align_bags or [bag]))
-    aligned_on = 'nothing: the transform was given' if transform else bags
-    transform = transform or fit_transform(*((one.truth, one.images) for one in trained or [drive]))
+    drive = _localized(bag, Localizer(model, config, watch, kind), recipe, progress)
+    aligned_on = 'nothing: the transform was given'
+    if transform is None:
+        aligned_on = ', '.join(map(str, align_bags or [bag]))
+        transform = fit_transform(*((d.truth, d.images) for d in training_drives or [drive]))
     estimates = {'odometry': odometry_from_start(drive.truth, drive.run)}
     estimates |= {name: moved(track.poses, transform) for name, track in drive.tracks.items()}
-    return Evaluation(
-        drive.truth,
-        estimates,
-        _scores(drive, estimates, transform),
-        {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])},
-        drive.features,
-        aligned_on,
-        transform,
-    )
-
-
-def _scores(
-    drive: _Drive, estimates: Mapping[str, Trajectory], transform: RigidTransform
-) -> Scores:
-    """The errors of every estimate; of the model's also calibration and similarity."""
-    truth, turn = drive.truth, rotation(transform.yaw_rad)
-    scores = {name: score(truth, estimate) for name, estimate in estimates.items()}
+    scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
+    turn = rotation(transform.yaw_rad)
     for name, track in drive.tracks.items():
-        scores[name] |= calibration(truth, estimates[name], turn, track.covariances)
-        scores[name]['similarity'] = similarity(truth, estimates[name])
-    return scores
+        scores[name] |= calibration(drive.truth, estimates[name], turn, track.covariances)
+        scores[name]['similarity'] = similarity(drive.truth, estimates[name])
+    counts = {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])}
+    return Evaluation(drive.truth, estimates, scores, counts, drive.features, aligned_on, transform)
 
 
 def observed(
     bag: Path, observer: Observer, recipe: Recipe, progress: bool, want_truth: bool = True
 ) -> tuple[Run, list[Observation]]:
-    """A drive, and what the model makes of its images as the nodes see them; `recipe` is live.
+    """A drive, and the observations of its images as sfa_node makes them; `recipe` is live.
 
     Raises BagError or DataError, also without a wanted truth.
     """
     run = _read(bag, recipe, progress, want_truth)
-    images, title = observer.observe_run(run), f'locate the images of {run.name}'
-    return run, [*progress_over(images, title, len(run.panoramas), shown=progress)]
+    return run, list(_observations(run, observer, progress))
 
 
-def _present(path: Path, recipe: Recipe) -> Recipe:
-    """The recipe with the names of topics that a bag has; others are found by their types there."""
+def _observations(run: Run, observer: Observer, progress: bool) -> Iterator[Observation]:
+    title = f'locate the images of {run.name}'
+    return progress_over(observer.observe_run(run), title, len(run.panoramas), shown=progress)
+
+
+def _with_topics_of(path: Path, recipe: Recipe) -> Recipe:
+    """The recipe, without names of topics that the bag lacks: it finds these topics by type."""
     with Bag(path) as bag:
-        there = {f'/{name.lstrip("/")}' for name in bag.topics}
+        recorded = {f'/{name.lstrip("/")}' for name in bag.topics}
     missing = {
         item.name: ''
         for item in fields(recipe.topics)
-        if f'/{getattr(recipe.topics, item.name).partition(":")[0].lstrip("/")}' not in there
+        if f'/{getattr(recipe.topics, item.name).partition(":")[0].lstrip("/")}' not in recorded
     }
     return replace(recipe, topics=replace(recipe.topics, **missing))
 
@@ -180,135 +172,138 @@ def _read(bag: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Run:
     cache = image_folder(Path(tempfile.gettempdir()) / 'sfa_localization_evaluate')
     run = read_drive(bag, cache, recipe, progress, want_truth=truth)
     if truth and (run.ground_truth is None or len(run.ground_truth) < 2):
-        raise DataError(f'{bag}: no ground truth to judge by; name it with --ground-truth-topic')
+        raise DataError(f'{bag}: has no ground truth; name its topic with --ground-truth-topic')
     return run
 
 
-def _driven(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Drive:
+def _localized(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Localized:
     """Run model and filter over a bag. Raises BagError or DataError."""
-    run = _read(bag, recipe, progress)
-    observations, moments = _replayed(localizer, run, progress)
-    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
-    usable = [one for one in observations if not one.problem]
+    run, fused = _read(bag, recipe, progress), localizer.filter
+    assert run.ground_truth is not None
+    observations, levels = list[Observation](), dict[int, Level]()
+    states, localised = list[State](), list[bool]()
+    images = run.panoramas.stamps_ns, _observations(run, localizer.observer, progress)
+    for stamp_ns, observation, _ in replay(fused, run.odometry, *images):
+        if observation is not None:
+            observations.append(observation)
+            continue
+        levels[stamp_ns] = fused.status.level
+        if state := fused.at(stamp_ns):
+            states.append(state)
+            localised.append(fused.status.level is Level.LOCALISED)
+    usable = [observation for observation in observations if not observation.problem]
     if not usable:
         raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
-    skipped = Counter(one.problem for one in observations if one.problem)
-    counts: dict[str, Any] = {name: count.as_dict() for name, count in run.counts.items()}
-    counts['observations'] = Count(len(usable), dict(skipped)).as_dict()
-    stamps, levels, states = zip(*moments, strict=True) if moments else ((), (), ())
-    lasted_s = _lasted_s(np.array([run.odometry.stamps_ns[0], *stamps]))[1:]
-    counts['fusion'], counts['states_s'] = (
-        dict(localizer.filter.counts),
-        {
-            level.name: float(lasted_s[np.array(levels) == level].sum())
-            for level in dict.fromkeys(levels)
-        },
-    )
-    counts['nis'] = None if math.isnan(localizer.filter.nis) else localizer.filter.nis
-    if clock.delay_ns:
-        counts['camera_delay_s'] = round(clock.delay_s, 3)
+    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
+    counts = _counts(run, observations, levels, fused, clock)
     if OpenLoop.of(run.odometry.twists).found:  # the robot is late, not the images
         clock = CameraClock()
-    located = [(state, level) for level, state in zip(levels, states, strict=True) if state]
-    tracks = {'sfa': _images(usable, clock), 'ekf': Track.of([state for state, _ in located])}
-    if isinstance(localizer.filter, Smoother):
-        tracks['smoothed'] = Track.of(localizer.filter.smoothed())
-    sure = np.array([level is Level.LOCALISED for _, level in located], bool)
-    assert run.ground_truth is not None
-    features = np.array([one.slow_features for one in usable])
-    return _Drive(run, run.ground_truth, tracks, features, sure, counts)
+    tracks = {'sfa': _track(usable, clock), 'ekf': Track.of(states)}
+    if isinstance(fused, Smoother):
+        tracks['smoothed'] = Track.of(fused.smoothed())
+    features = np.array([observation.slow_features for observation in usable])
+    return _Localized(run, run.ground_truth, tracks, features, np.array(localised, bool), counts)
 
 
-def _replayed(
-    localizer: Localizer, run: Run, progress: bool
-) -> tuple[list[Observation], list[tuple[int, Level, State | None]]]:
-    """Observations of all images; stamp, level and estimate at each odometry message."""
-    observations, moments = list[Observation](), list[tuple[int, Level, State | None]]()
-    title = f'locate the images of {run.name}'
-    with progress_bar(title, len(run.panoramas), shown=progress) as bar:
-        for stamp_ns, observation, state in localizer.replay(run):
-            if observation is None:
-                moments.append((stamp_ns, localizer.status.level, state))
-                continue
-            observations.append(observation)
-            bar.update()
-    return observations, moments
+def _counts(
+    run: Run,
+    observations: Sequence[Observation],
+    levels: Mapping[int, Level],
+    fused: PoseFilter,
+    clock: CameraClock,
+) -> dict[str, Any]:
+    """Used and skipped messages and images, the filter's counts, and seconds in each state."""
+    skipped = Counter(problem for item in observations if (problem := item.problem))
+    usable = Count(len(observations) - skipped.total(), dict(skipped))
+    states_s = Counter[str]()
+    seconds = _seconds_since_last(np.array([run.odometry.stamps_ns[0], *levels]))[1:]
+    for level, lasted_s in zip(levels.values(), seconds.tolist(), strict=True):
+        states_s[level.name] += lasted_s
+    return {
+        **{name: count.as_dict() for name, count in run.counts.items()},
+        'observations': usable.as_dict(),
+        'fusion': dict(fused.counts),
+        'states_s': dict(states_s),
+        'nis': None if math.isnan(fused.nis) else fused.nis,
+        **({'camera_delay_s': round(clock.delay_s, 3)} if clock.delay_ns else {}),
+    }
 
 
-def _lasted_s(stamps_ns: Stamps) -> Array:
-    """Seconds (N,) until each stamp from the one before, at most COAST_S: in a pause of the
-    recording nobody says anything.
+def _seconds_since_last(stamps_ns: Stamps) -> Array:
+    """Seconds (N,) from the stamp before to each stamp, COAST_S at most: in a pause of the
+    recording the filter publishes nothing.
     """
     return np.minimum(np.diff(stamps_ns, prepend=stamps_ns[:1]) * 1e-9, COAST_S)
 
 
-def _images(usable: list[Observation], clock: CameraClock) -> Track:
-    """The usable images in the map.
-
-    The map is judged where images were taken, by `clock`; the filter has to find out by itself.
-    """
-    stamps = np.array([one.stamp_ns for one in usable], np.int64) - clock.delay_ns
-    poses = np.array([[*one.position, one.yaw] for one in usable])
-    return Track(Trajectory(stamps, poses), np.array([one.covariance for one in usable]))
+def _track(usable: Sequence[Observation], clock: CameraClock) -> Track:
+    """The poses of single images, at the times when they were taken by `clock`."""
+    stamps = np.array([image.stamp_ns for image in usable], np.int64) - clock.delay_ns
+    poses = np.array([[*image.position, image.yaw] for image in usable])
+    return Track(Trajectory(stamps, poses), np.array([image.covariance for image in usable]))
 
 
-def known(truth: Trajectory, stamps_ns: Stamps) -> Any:
-    """Mask (N,) of the stamps at which the truth is known."""
+def has_truth(truth: Trajectory, stamps_ns: Stamps) -> Mask:
+    """Mask (N,) of the stamps for which the ground truth was recorded."""
     return truth.covers(stamps_ns, _TRUTH_TOLERANCE_NS)
 
 
 def fit_transform(*drives: tuple[Trajectory, Trajectory]) -> RigidTransform:
-    """Rotation and translation that lay estimates, in the map, on the truth: of each drive its
-    truth and its estimates. Raises DataError.
+    """Least-squares rotation and translation from the map to the truth, over drives that are each
+    given as (truth, estimate in the map). Raises DataError.
     """
-    found, right = (np.concatenate(parts) for parts in zip(*map(_pairs, drives), strict=True))
-    if len(found) < 2:
+    estimated, true = (np.concatenate(parts) for parts in zip(*map(_pairs, drives), strict=True))
+    if len(estimated) < 2:
         raise DataError('the ground truth covers fewer than two images: are the clocks the same?')
-    return align(found, right)
+    return align(estimated, true)
 
 
 def _pairs(drive: tuple[Trajectory, Trajectory]) -> tuple[Array, Array]:
-    """Estimated and true positions (N, 2) m of a truth and its estimates, where both are known."""
+    """Estimated and true positions (N, 2) m of a (truth, estimate), where both exist."""
     truth, estimate = drive
-    mask = known(truth, estimate.stamps_ns) & np.isfinite(estimate.poses[:, 0])
+    mask = has_truth(truth, estimate.stamps_ns) & np.isfinite(estimate.poses[:, 0])
     return estimate.poses[mask, :2], truth.at(estimate.stamps_ns[mask])[:, :2]
 
 
 def similarity(truth: Trajectory, estimate: Trajectory) -> dict[str, float | None]:
-    """`mean` error (m) that is left when rotation, translation and `scale` are fitted on the
-    estimate itself: what remains when the wheels' radius and the map's place do not matter.
+    """`mean` error (m) after rotation, translation and `scale` are fitted on the estimate itself:
+    the error without that of the wheels' radius and of the place of the map.
     """
-    found, right = _pairs((truth, estimate))
-    if len(found) < 2:
+    estimated, true = _pairs((truth, estimate))
+    if len(estimated) < 2:
         return {'mean': None, 'scale': None}
-    laid = align(found, right).apply(found)
-    offset, center = laid - laid.mean(0), right.mean(0)
+    aligned, center = align(estimated, true).apply(estimated), true.mean(0)
+    offset = aligned - aligned.mean(0)
     square = float((offset**2).sum())
-    scale = float((offset * (right - center)).sum()) / square if square > 0 else 1.0
-    errors = np.hypot(*(scale * offset + center - right).T)
+    scale = float((offset * (true - center)).sum()) / square if square > 0 else 1.0
+    errors = np.hypot(*(scale * offset + center - true).T)
     return {'mean': float(errors.mean()), 'scale': scale}
 
 
 def calibration(
     truth: Trajectory, estimate: Trajectory, turn: Array, covariances: Array
 ) -> dict[str, Any]:
-    """Shares of the errors that regions of 95 % hold: `within_95` of the positions' ellipses,
-    `yaw_within_95` of the headings' intervals; and `nees`, the normalized squared error of the
-    positions over its expectation. `nees_right` [low, high] holds it on 95 % of drives with right
-    covariances: neighboring errors are alike, so that one drive shows few of them.
+    """Whether the covariances are right.
 
-    `covariances` (N, 3, 3) of [x, y, yaw] are in the map, `turn` (2, 2) rotates it to the truth.
+    `within_95` is the share of positions inside their 95 % ellipse, `yaw_within_95` that of
+    headings inside their 95 % interval. `nees` is the mean normalized squared position error over
+    its expectation. With right covariances it lies in `nees_right` [low, high] on 95 % of such
+    drives; errors of neighboring images are correlated, so this range is wide.
+
+    `covariances` (N, 3, 3) of [x, y, yaw] are in the map, which `turn` (2, 2) rotates to the truth.
     """
-    mask = known(truth, estimate.stamps_ns)
+    mask = has_truth(truth, estimate.stamps_ns)
     if not mask.any():
         return dict.fromkeys(('within_95', 'yaw_within_95', 'nees', 'nees_right'))
-    apart = estimate.poses[mask] - truth.at(estimate.stamps_ns[mask])
-    offset, covariances = apart[:, :2] @ turn, covariances[mask]
+    errors, covariances = (
+        estimate.poses[mask] - truth.at(estimate.stamps_ns[mask]),
+        covariances[mask],
+    )
     roots = np.linalg.cholesky(covariances[:, :2, :2])
-    normalized = np.linalg.solve(roots, offset[:, :, None])[:, :, 0]
+    normalized = np.linalg.solve(roots, (errors[:, :2] @ turn)[:, :, None])[:, :, 0]
     squares = (normalized**2).sum(1)
-    freedom = 2 * _independent(normalized)
-    yaw = wrap_angle(apart[:, 2]) ** 2 / covariances[:, 2, 2]
+    freedom = 2 * _effective_count(normalized)
+    yaw = wrap_angle(errors[:, 2]) ** 2 / covariances[:, 2, 2]
     yaw = yaw[np.isfinite(yaw)]
     return {
         'within_95': float((squares <= stats.chi2.ppf(0.95, 2)).mean()),
@@ -318,71 +313,64 @@ def calibration(
     }
 
 
-def _independent(normalized: Array) -> float:
-    """How many independent squares are worth those of errors (N, 2) that neighbors share.
+def _effective_count(normalized: Array) -> float:
+    """Number of independent errors whose mean square varies as that of correlated ones (N, 2).
 
-    A mean of squares of Gaussian errors with correlation r(lag) varies as that of
-    N / sum of r(lag)^2 independent ones; r counts as far as it is positive.
+    For Gaussian errors of autocorrelation r it is N / sum of r(lag)^2, up to the first r <= 0.
     """
     count = len(normalized)
-    lagged = (signal.correlate(one, one, method='fft')[count - 1 :] for one in normalized.T)
+    lagged = (signal.correlate(axis, axis, method='fft')[count - 1 :] for axis in normalized.T)
     shared: Array = np.sum([*lagged], axis=0)
-    fades = np.flatnonzero(shared <= 0)
-    shared = shared[: fades[0]] if len(fades) else shared
+    zeros = np.flatnonzero(shared <= 0)
+    shared = shared[: zeros[0]] if len(zeros) else shared
     return count / (1 + 2 * float(((shared[1:] / shared[0]) ** 2).sum())) if len(shared) else count
 
 
-def _false_localised_s(drive: _Drive, ekf: Trajectory) -> float:
-    """Seconds in which the filter was LOCALISED and more than `WRONG_M` off."""
-    stamps, truth = ekf.stamps_ns, drive.truth
-    apart = np.hypot(*(ekf.poses - truth.at(stamps))[:, :2].T)
-    wrong = drive.sure & known(truth, stamps) & (apart > WRONG_M)
-    return float(_lasted_s(stamps)[wrong].sum())
+def _false_localised_s(drive: _Localized, ekf: Trajectory) -> float:
+    """Seconds in which the filter said LOCALISED and its position error exceeded `WRONG_M`."""
+    errors = np.hypot(*(ekf.poses - drive.truth.at(ekf.stamps_ns))[:, :2].T)
+    wrong = drive.localised & has_truth(drive.truth, ekf.stamps_ns) & (errors > WRONG_M)
+    return float(_seconds_since_last(ekf.stamps_ns)[wrong].sum())
 
 
 def moved(estimate: Trajectory, transform: RigidTransform) -> Trajectory:
-    """A trajectory in the frame that the transform leads to."""
+    """The trajectory in the frame to which the transform leads."""
     positions = transform.apply(estimate.poses[:, :2])
     yaw = transform.apply_yaw(estimate.poses[:, 2])
     return Trajectory(estimate.stamps_ns, np.column_stack([positions, yaw]))
 
 
 def odometry_from_start(truth: Trajectory, run: Run) -> Trajectory:
-    """Odometry alone, from the true pose where the truth begins."""
+    """The path of the odometry from the true pose at the start of the truth. Raises DataError."""
     path = run.odometry.trajectory
-    stamps = path.stamps_ns[known(truth, path.stamps_ns)]
+    stamps = path.stamps_ns[has_truth(truth, path.stamps_ns)]
     if len(stamps) == 0:
-        raise DataError(f'{run.name}: ground truth and odometry share no time')
+        raise DataError(f'{run.name}: ground truth and odometry do not overlap in time')
     start = compose(truth.at(stamps[:1])[0], invert(path.at(stamps[:1])[0]))
-    return Trajectory(stamps, compose(np.broadcast_to(start, (len(stamps), 3)), path.at(stamps)))
+    return Trajectory(stamps, compose(start, path.at(stamps)))
 
 
 def score(truth: Trajectory, estimate: Trajectory) -> dict[str, Any]:
     """Mean, median, 95th percentile, rmse, max (m) and count of the position errors.
 
-    `yaw_deg` holds mean, median and p95 of the heading errors where there is a heading. The
-    numbers are None where no estimate can be judged.
+    `yaw_deg` holds mean, median and p95 of the heading errors, None without headings. The numbers
+    are None where the truth covers no estimate.
     """
-    mask = known(truth, estimate.stamps_ns)
-    at = truth.at(estimate.stamps_ns[mask])
-    errors = np.hypot(*(estimate.poses[mask, :2] - at[:, :2]).T)
-    yaw = np.degrees(np.abs(wrap_angle(estimate.poses[mask, 2] - at[:, 2])))
+    mask = has_truth(truth, estimate.stamps_ns)
+    errors = estimate.poses[mask] - truth.at(estimate.stamps_ns[mask])
+    position, yaw = np.hypot(*errors[:, :2].T), np.degrees(np.abs(wrap_angle(errors[:, 2])))
     yaw = yaw[np.isfinite(yaw)]
-    if len(errors) == 0:
-        empty = dict.fromkeys(('mean', 'median', 'p95', 'rmse', 'max'))
-        return {**empty, 'n': 0, 'yaw_deg': None}
+    if len(position) == 0:
+        return {**dict.fromkeys(('mean', 'median', 'p95', 'rmse', 'max')), 'n': 0, 'yaw_deg': None}
     return {
-        **_summary(errors),
-        'rmse': float(np.sqrt((errors**2).mean())),
-        'max': float(errors.max()),
-        'n': len(errors),
+        **_summary(position),
+        'rmse': float(np.sqrt((position**2).mean())),
+        'max': float(position.max()),
+        'n': len(position),
         'yaw_deg': _summary(yaw) if len(yaw) else None,
     }
 
 
 def _summary(values: Array) -> dict[str, float]:
-    return {
-        'mean': float(values.mean()),
-        'median': float(np.median(values)),
-        'p95': float(np.percentile(values, 95)),
-    }
+    mean, median, p95 = values.mean(), np.median(values), np.percentile(values, 95)
+    return {'mean': float(mean), 'median': float(median), 'p95': float(p95)}

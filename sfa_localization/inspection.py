@@ -24,8 +24,6 @@ from sfa_localization.bags.reader import KINDS, Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera import kinds
-from sfa_localization.camera.panorama import looks_like_panorama
-from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import BagError, MessageError
@@ -36,9 +34,7 @@ from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
 from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
-from sfa_localization.keyframes.closures import STRETCH_M, Views, driven
-from sfa_localization.keyframes.leveling import links_between
-from sfa_localization.keyframes.texture import quantized, texture
+from sfa_localization.keyframes.closures import STRETCH_M
 from sfa_localization.metric.drive_check import ROUTE, is_one_route
 from sfa_localization.metric.motion_check import MotionCheck, check_motion
 from sfa_localization.metric.motion_sources import IMAGES, POSE, late
@@ -46,24 +42,23 @@ from sfa_localization.metric.points import stops
 from sfa_localization.metric.segments import PIECE_LENGTH_M
 
 SAMPLES, SAMPLE_SIDE = 16, 640
-"""Images on the contact sheet, and their longer side (pixels)."""
+"""Number of images on the contact sheet, and their longer side (pixels)."""
 SECTORS = 6
-"""Line directions that are distinguished, of 30 degrees each."""
-# What a drive needs: directions, each with a share of the path (with fewer the shape of the map
-# remains ambiguous), and a share of the area (below it whole regions are extrapolated).
+"""Number of driving directions, of 30 degrees each; forth and back are the same."""
+# A drive needs directions, each with a share of the path, or the shape of the map is ambiguous, and
+# a covered share of the area, or the map is extrapolated over whole regions.
 MIN_DIRECTIONS, MIN_SHARE, MIN_COVERED = 3, 0.05, 0.65
-MAX_LOST = 0.1  # share of images that may lack odometry: more means that clocks are wrong
-MAX_GAP_S = 2.0  # longest pause of a topic that is not reported
-EVEN, EVEN_SHARE = 3.0, 0.9  # a topic keeps time where this share of intervals is that usual
-REPEATED = 0.05  # share of images that repeat the one before that is worth a word
-STANDING_M = 0.02  # images nearer to each other were taken standing
-GRID = 100  # points per axis at which coverage is evaluated: steps of 1 % of the area's extent
-VIEWS, FEWEST_LINKS = 400, 50  # images that show how the ground tilts the camera, and their pairs
+MAX_WITHOUT_ODOMETRY = 0.1  # share of images; more means that the clocks differ
+MAX_GAP_S = 2.0  # longer pauses of a topic are reported
+EVEN, EVEN_SHARE = 3.0, 0.9  # a topic is periodic if this share of intervals is below 3 medians
+MAX_REPEATED = 0.05  # share of images that repeat the last one; more are reported
+STANDING_M = 0.02  # between images of a robot that stands
+GRID = 100  # points per axis at which coverage is evaluated
 DARK = 12.0  # mean gray level of 255 below which an image is dark
 
-# Images at one place in other headings, which show where the camera sits; how many are compared.
-SAME_PLACE_M, OTHER_HEADING_RAD, PAIRS_MIN, COMPARED = 0.5, math.radians(30.0), 10, 2000
-ONE_HEADING = (
+# Pairs of images at a place with different headings show the lever arm of the camera.
+SAME_PLACE_M, OTHER_HEADING_RAD, MIN_PAIRS, COMPARED = 0.5, math.radians(30.0), 10, 2000
+NO_LEVER_ARM = (
     'no place is seen in two headings, so nothing shows where the camera sits on the robot: turn '
     'on the spot where you have been, or set camera_xy'
 )
@@ -84,9 +79,10 @@ class InspectionConfig(Settings):
 
 @dataclass
 class TopicReport:
-    """One topic: `problems` are sentences; stamps are those of the sender where it set them.
+    """A topic with its `problems`, as sentences.
 
-    `recorded` is the count of the bag's metadata or index; what can be read of it has a stamp.
+    `stamps_ns` are those of the readable messages, from their headers if they have one; `recorded`
+    is the count of the bag's metadata or index.
     """
 
     name: str
@@ -97,17 +93,17 @@ class TopicReport:
 
     @property
     def count(self) -> int:
-        """Messages that can be read."""
+        """Number of readable messages."""
         return len(self.stamps_ns)
 
     @property
     def unreadable(self) -> bool:
-        """Whether messages were recorded, and none can be read."""
+        """Whether messages were recorded, but none can be read."""
         return self.recorded > 0 and self.count == 0
 
     @property
     def rate_hz(self) -> float:
-        """Messages per second, by the median of their intervals; 0 for fewer than two."""
+        """Messages per second, by the median interval; 0 for fewer than two."""
         steps = np.diff(self.stamps_ns)
         return float(1e9 / max(np.median(steps), 1)) if len(steps) else 0.0
 
@@ -118,7 +114,7 @@ class TopicReport:
 
     @property
     def pauses(self) -> bool:
-        """Whether messages come evenly but for a pause: a topic may speak only on change."""
+        """Whether a periodic topic paused; others may be published on change only."""
         steps = np.diff(self.stamps_ns)
         even = len(steps) and np.mean(steps <= EVEN * np.median(steps)) >= EVEN_SHARE
         return bool(even and self.largest_gap_s > max(MAX_GAP_S, 5 / max(self.rate_hz, 1e-9)))
@@ -141,10 +137,9 @@ class TopicReport:
 class BagReport:
     """All findings about a bag; `lacks` are the reasons why it is not enough to train on.
 
-    `error` is the reason why it cannot be read at all. `samples` are images from all over the
-    drive; `camera` says what took them. `places` (M, 3) are the poses of images with `odometry`,
-    and `motion` compares it with the images and the gyroscope; `tilt` says how the ground tilts the
-    camera, if anything does.
+    `error` says why it cannot be read at all. `samples` are images from all over the drive, and
+    `camera` the kind of camera that they show. `places` (M, 3) are the poses of images with
+    `odometry`; `motion` compares odometry, images and gyroscope; `tilt` is that of the ground.
     """
 
     path: str
@@ -164,7 +159,7 @@ class BagReport:
 
     @property
     def facts(self) -> dict[str, str]:
-        """Camera and drive, in words."""
+        """Sentences about camera, drive, stops and ground."""
         facts = {}
         if self.camera is not None:
             facts['images'] = str(self.camera)
@@ -175,8 +170,8 @@ class BagReport:
                 f'{spacing(self.places):.2f} m apart, '
                 f'along {directions(self.places)} of {SECTORS} directions'
             )
-            since_s = (stops(self.odometry) - self.odometry.stamps_ns[0]) * 1e-9
-            stood = [f'stop {k} at {a:.1f} to {b:.1f} s' for k, (a, b) in enumerate(since_s, 1)]
+            stops_s = (stops(self.odometry) - self.odometry.stamps_ns[0]) * 1e-9
+            stood = [f'stop {k} at {a:.1f} to {b:.1f} s' for k, (a, b) in enumerate(stops_s, 1)]
             facts |= {'stood': ', '.join(stood)} if stood else {}
         if self.tilt:
             facts['ground'] = self.tilt
@@ -233,22 +228,22 @@ def inspect(
     """
     topics, report = topics or TopicNames(), BagReport(str(path))
     with Bag(path, strict=strict, config=bag_config) as bag:
-        report.image_topic = _found(bag, 'image', topics.image, report)
-        report.odometry_topic = _found(bag, 'odometry', topics.odometry, report)
+        report.image_topic = _topic_of(bag, 'image', topics.image, report)
+        report.odometry_topic = _topic_of(bag, 'odometry', topics.odometry, report)
         _Survey(bag, report, topics, clockwise).fill()
         report.problems, report.notes = bag.problems, bag.recording.notes
     if _one_route(report.places):
         report.notes.append(ROUTE)
     if path_length(report.places) >= 1.0 and not headings_differ(report.places):
-        report.notes.append(ONE_HEADING)
+        report.notes.append(NO_LEVER_ARM)
     if report.lacks and report.motion:
         report.lacks += report.motion.wrong
     report.lacks += [] if report.lacks else lacks(report, config or InspectionConfig())
     return report
 
 
-def _found(bag: Bag, kind: str, name: str, report: BagReport) -> str:
-    """The topic of a kind, or '' with the reason among what the bag lacks."""
+def _topic_of(bag: Bag, kind: str, name: str, report: BagReport) -> str:
+    """The topic of a kind; '' if there is none, and the reason goes to `report.lacks`."""
     try:
         return bag.find(kind, name)
     except BagError as error:
@@ -261,19 +256,17 @@ class _Survey:
 
     def __init__(self, bag: Bag, report: BagReport, topics: TopicNames, clockwise: bool) -> None:
         self._bag, self._report = bag, report
-        # None where there is none: damaged bags also have topics without a name.
+        # None without a topic: in damaged bags, '' can be the name of a topic.
         self._image = report.image_topic or None
-        self._driven = report.odometry_topic.partition(':')[0] or None
-        has = topics.imu or any(topic.kind == decoding.IMU for topic in bag.topics.values())
-        self._imu = (_found(bag, 'imu', topics.imu, report) if has else '') or None
+        self._odometry = report.odometry_topic.partition(':')[0] or None
+        has_imu = topics.imu or any(topic.kind == decoding.IMU for topic in bag.topics.values())
+        self._imu = (_topic_of(bag, 'imu', topics.imu, report) if has_imu else '') or None
         self._values: dict[str | None, list[tuple[int, Any]]] = {name: [] for name in bag.topics}
         self._gyro, self._frozen, self._repeats = VisualGyro(clockwise), FrozenWatch(), 0
         self._sizes: Counter[tuple[int, ...]] = Counter()
         count = bag.topics[self._image].count if self._image else 0
-        self._every, self._looked = max(count // SAMPLES, 1), -(-count // VIEWS) or 1
-        self._sphere = PanoramaConfig(clockwise=clockwise).sphere
-        self._textures: list[tuple[int, NDArray[np.int8]]] = []
-        self._leaning: list[tuple[float, float]] = []
+        self._every = max(count // SAMPLES, 1)
+        self._rolls_and_pitches: list[tuple[float, float]] = []
 
     def fill(self) -> None:
         """Read the bag, and fill the report."""
@@ -287,59 +280,45 @@ class _Survey:
             alike = [sample for sample in samples if sample.shape == samples[0].shape]
             self._report.camera = kinds.kind_of(alike, width, height)
         for stream in streams:
-            if stream.topic == self._driven and self._values[self._driven]:
+            if stream.topic == self._odometry and self._values[self._odometry]:
                 self._drive(stream)
 
     def _stream(self, name: str) -> Stream:
-        if name == self._driven:
+        if name == self._odometry:
             stream = self._bag.stream(self._report.odometry_topic, decoding.odometry_of)
             stream.required = False
             return stream
         if name == self._image:
-            return self._bag.any_stream(name, self._sample)
+            return self._bag.any_stream(name, self._take)
         if name == self._imu:
-            return self._bag.any_stream(name, self._turning)
-        image = self._bag.topics[name].kind in KINDS['image'].found
-        return self._bag.any_stream(name, _checked if image else lambda message: None)
+            return self._bag.any_stream(name, self._yaw_rate)
+        is_image = self._bag.topics[name].kind in KINDS['image'].found
+        # Other images are decoded to detect damage, and not kept.
+        check = (lambda m: decoding.image_of(m).shape) if is_image else (lambda _: None)
+        return self._bag.any_stream(name, check)
 
-    def _sample(self, message: Any) -> tuple[float, NDArray[np.int8] | None]:
-        """Decode an image; keep its size, and every so often the image itself.
+    def _take(self, message: Any) -> tuple[float, NDArray[np.int8] | None]:
+        """Decode an image, and keep a sample now and then.
 
-        Returns how far images have turned so far, rad, and a small texture; None of repetitions.
+        Returns the turn of the camera since the first image, rad, and a small texture of the image,
+        None if it repeats the last one.
         """
         image, samples = decoding.image_of(message), self._report.samples
         new = self._frozen.add(image)
         self._repeats += not new
         if self._sizes.total() % self._every == 0 and len(samples) < SAMPLES:
-            samples.append(_small(image))
-        number = self._sizes.total()
-        if number % self._looked == 0 and looks_like_panorama(*image.shape[:2]):
-            self._textures.append((number, quantized(texture(image)[None])))
+            scale = min(SAMPLE_SIDE / max(image.shape[:2]), 1.0)
+            small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            samples.append(np.asarray(small, np.uint8))
         self._sizes[image.shape[:2]] += 1
         yaw = self._gyro.add(kinds.unrolled(image))
         return yaw, self._gyro.texture if new else None
 
-    def _turning(self, message: Any) -> tuple[float, float]:
-        """The yaw rate of an Imu, and its variance; notes roll and pitch where it has them."""
+    def _yaw_rate(self, message: Any) -> tuple[float, float]:
+        """Yaw rate and its variance from an Imu; roll and pitch are kept if it has them."""
         with contextlib.suppress(MessageError):
-            self._leaning.append(read_tilt(message))
+            self._rolls_and_pitches.append(read_tilt(message))
         return read_yaw_rate(message)
-
-    def _tilt(self, stamps: Stamps, odometry: Odometry) -> str:
-        """How the ground tilts the camera, of images with stamps (N,)."""
-        if self._leaning:
-            return f'tilts the robot by {np.degrees(np.std(self._leaning, 0).mean()):.1f} degrees'
-        shape = self._textures[0][1].shape if self._textures else ()
-        known = [(n, one) for n, one in self._textures if n < len(stamps) and one.shape == shape]
-        if not known:
-            return ''
-        rows, textures = np.array([n for n, _ in known]), np.concatenate([one for _, one in known])
-        path = driven(odometry, stamps)[rows]
-        links = links_between(Views(textures, rows, np.zeros_like(rows), path), self._sphere)
-        tilts = links.tilts(np.zeros(len(rows), complex))
-        tilt = math.degrees(math.sqrt(float(np.mean(np.abs(tilts) ** 2)) / 2))  # along each axis
-        about = f'tilts the camera by at least {tilt:.1f} degrees'
-        return about if len(links.found) >= FEWEST_LINKS else ''
 
     def _topic(self, stream: Stream) -> TopicReport:
         topic = self._bag.topics[stream.topic]
@@ -359,39 +338,28 @@ class _Survey:
             return
         if len(self._sizes) > 1:
             yield f'images of several sizes: {", ".join(f"{w}x{h}" for h, w in self._sizes)}'
-        if self._repeats > REPEATED * report.recorded:
+        if self._repeats > MAX_REPEATED * report.recorded:
             yield f'{self._repeats} of {report.recorded} images repeat the one before'
 
     def _drive(self, stream: Stream) -> None:
-        """The path, and what images and gyroscope, in the order of their stamps, say of it."""
+        """Fill in the path, the tilt, and the comparison with images and gyroscope."""
         report, camera = self._report, self._report.camera
-        odometry = self._bag.to_odometry(stream, self._values[self._driven])
+        odometry = self._bag.to_odometry(stream, self._values[self._odometry])
         images = self._values.get(self._image, [])
         stamps = np.array([stamp for stamp, _ in images], np.int64)
         near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
         report.odometry, report.places = odometry, odometry.trajectory.at(near)
-        seen = np.array([yaw for _, (yaw, _) in images], float)
+        yaw = np.array([yaw for _, (yaw, _) in images], float)
         new = [(stamp, texture) for stamp, (_, texture) in images if texture is not None]
-        views = (
-            (np.array([at for at, _ in new]), np.stack([one for _, one in new])) if new else None
-        )
-        report.tilt = self._tilt(stamps, odometry) if len(stamps) else ''
-        shown = (stamps, seen) if camera is not None and camera.shows_turns else None
+        views = (np.array([s for s, _ in new]), np.stack([t for _, t in new])) if new else None
+        if self._rolls_and_pitches:
+            tilt = np.degrees(np.std(self._rolls_and_pitches, 0).mean())
+            report.tilt = f'tilts the robot by {tilt:.1f} degrees'
+        turns = (stamps, yaw) if camera is not None and camera.shows_turns else None
         rates = self._values.get(self._imu, [])
         gyro = to_yaw_rate(sorted(rates)) if rates else None
-        report.motion = check_motion(
-            odometry, shown, gyro, camera is not None and camera.is_panorama, views
-        )
-
-
-def _checked(message: Any) -> None:
-    """Decode an image, which may be faulty, and forget it."""
-    decoding.image_of(message)
-
-
-def _small(image: Image) -> Image:
-    scale = min(SAMPLE_SIDE / max(image.shape[:2]), 1.0)
-    return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+        is_panorama = camera is not None and camera.is_panorama
+        report.motion = check_motion(odometry, turns, gyro, is_panorama, views)
 
 
 def path_length(poses: Array) -> float:
@@ -422,14 +390,14 @@ def covered_share(places: Array, reach_m: float) -> float:
 
 
 def spacing(places: Array) -> float:
-    """Distance in meters of neighboring places (N, >= 2) while driving, 90th percentile."""
+    """90th percentile of the distance (m) between successive places (N, >= 2) while driving."""
     steps = np.hypot(*np.diff(places[:, :2], axis=0).T)
     steps = steps[steps > STANDING_M]
     return float(np.percentile(steps, 90)) if len(steps) else 0.0
 
 
 def directions(places: Array) -> int:
-    """Number of line directions with MIN_SHARE of the path through places (N, >= 2) or more."""
+    """Number of directions that have at least MIN_SHARE of the path through places (N, >= 2)."""
     steps = np.diff(places[:, :2], axis=0)
     length = np.hypot(steps[:, 0], steps[:, 1])
     angle = np.arctan2(steps[:, 1], steps[:, 0]) % np.pi
@@ -439,24 +407,24 @@ def directions(places: Array) -> int:
 
 
 def _one_route(places: Array) -> bool:
-    """Whether training will learn one route, and no area, from images at places (M, 3)."""
+    """Whether training will learn a route, not an area, from images at places (M, 3)."""
     moved = len(places) > 1 and path_length(places) >= 1.0
     return moved and is_one_route(places[:, 0] + 1j * places[:, 1], PIECE_LENGTH_M)
 
 
 def headings_differ(places: Array) -> bool:
-    """Whether a robot came back to some of its places (N, 3) with another heading."""
+    """Whether a robot came back to enough of its poses (N, 3) with another heading."""
     moved = np.hypot(*np.diff(places[:, :2], axis=0, prepend=places[:1, :2]).T)
     rows = evenly(len(places), COMPARED)
     driven, places = np.cumsum(moved)[rows], places[rows]
     first, last = cKDTree(places[:, :2]).query_pairs(SAME_PLACE_M, output_type='ndarray').T
     again = np.abs(driven[first] - driven[last]) >= STRETCH_M
     turned = np.abs(wrap_angle(places[first, 2] - places[last, 2])) >= OTHER_HEADING_RAD
-    return int((again & turned).sum()) >= PAIRS_MIN
+    return int((again & turned).sum()) >= MIN_PAIRS
 
 
-def lanes_apart(places: Array, reach_m: float) -> list[str]:
-    """That too little of the ground is near to an image, at places (N, >= 2); else nothing."""
+def sparse_lanes(places: Array, reach_m: float) -> list[str]:
+    """A sentence if too little of the ground is near an image, for images at places (N, >= 2)."""
     share = covered_share(places, reach_m)
     if share >= MIN_COVERED:
         return []
@@ -468,7 +436,7 @@ def lanes_apart(places: Array, reach_m: float) -> list[str]:
 
 
 def too_sparse(places: Array, most_m: float) -> list[str]:
-    """That images at places (N, >= 2) are too far apart while driving; else nothing."""
+    """A sentence if images at places (N, >= 2) are too far apart while driving."""
     gap = spacing(places)
     if gap <= most_m:
         return []
@@ -476,20 +444,20 @@ def too_sparse(places: Array, most_m: float) -> list[str]:
 
 
 def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
-    """The reasons why a bag is not enough to train on, each with the remedy."""
+    """The reasons why a bag is not enough to train on, each with its remedy."""
     if report.camera is None or report.motion is None:
         parts = ('images', report.camera), ('odometry', report.motion)
         yield f'no {" and no ".join(name for name, part in parts if part is None)} could be read'
         return
     yield from report.motion.wrong
-    shown = report.motion.pair(POSE, IMAGES)
-    if shown and abs(shown.late_s) * 1e9 > DELAY_LIMIT_NS:
-        yield f'images are stamped {late(shown.late_s)}: synchronize the clocks'
+    pair = report.motion.pair(POSE, IMAGES)
+    if pair and abs(pair.late_s) * 1e9 > DELAY_LIMIT_NS:
+        yield f'images are stamped {late(pair.late_s)}: synchronize the clocks'
     used = len(report.places)
     (recorded,) = (topic.count for topic in report.topics if topic.name == report.image_topic)
     if used < config.min_pictures:
         yield f'{used} images with odometry are few: drive until there are {config.min_pictures}'
-    if used < (1 - MAX_LOST) * recorded:
+    if used < (1 - MAX_WITHOUT_ODOMETRY) * recorded:
         yield (
             f'{recorded - used} of {recorded} images have no odometry nearby: '
             'record both all the time, stamped by one clock'
@@ -503,14 +471,14 @@ def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
 
 
 def _lacks_of_drive(places: Array, config: InspectionConfig, whole: bool) -> Iterator[str]:
-    """What images at places (N, 3) by odometry lack, whose parts may be anywhere if not `whole`."""
+    """What a drive with images at places (N, 3) lacks; the odometry has no breaks if `whole`."""
     if path_length(places) < 1.0:
         yield 'the robot did not move: drive it over the area'
         return
     yield from too_sparse(places, config.max_spacing)
     if not whole or _one_route(places):
         return
-    yield from lanes_apart(places, config.reach)
+    yield from sparse_lanes(places, config.reach)
     if directions(places) < MIN_DIRECTIONS:
         yield (
             f'driven along {directions(places)} of {SECTORS} directions: '

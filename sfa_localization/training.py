@@ -11,7 +11,7 @@
 7  learn it again, from maps turned by its headings      metric/turned_maps.py
 8  keyframes, and the model for section 5                metric/keyframe_map.py, place_model.py
 
-Steps 2, 7 and keyframes go beyond the paper; without closures step 6 is its section 3, eq. 1, 5.
+Steps 2 and 7 and the keyframes go beyond the paper; without closures, step 6 is its section 3.
 """
 
 from __future__ import annotations
@@ -28,11 +28,7 @@ from sfa_localization.data.threads import one_core
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.metric.drives import Maps, anchored, compare_with_map, learn_map, rig_of
 from sfa_localization.metric.keyframe_map import learn_keyframes
-from sfa_localization.metric.learning import (
-    MetricResult,
-    learn_metric,
-    with_turned,
-)
+from sfa_localization.metric.learning import MetricResult, learn_metric, with_turned
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.segments import Segments
 from sfa_localization.place_model import PlaceModel
@@ -48,7 +44,8 @@ from sfa_localization.training_input import TrainingInput, compared, train_hiera
 class Trained:
     """The model and the intermediate results of its training, for reports.
 
-    `features` (N, K) of all images, drive after drive; `metric` is that of the model's map.
+    `features` (N, K) are those of all images, drive after drive; `metric` belongs to the model's
+    map; `checks` hold the comparison of the sources of motion of each drive.
     """
 
     model: PlaceModel
@@ -57,7 +54,6 @@ class Trained:
     segments: Segments
     metric: MetricResult
     checks: tuple[MotionCheck, ...] = ()
-    """Of each drive: what its sources of motion tell of each other."""
 
 
 @one_core()
@@ -73,10 +69,10 @@ def train(
 ) -> Trained:
     """Learn a place model from bags and write it to `output`.
 
-    Images, odometry and gyroscope are compared first: what cannot be right is an error, or with
-    `force` a warning. A training that was interrupted leaves a checkpoint beside the output; with
-    `resume` it goes on from there and gives the same bytes (the engine mdp starts again). Raises
-    BagError, ConfigError, DataError or ModelError; then no model is written.
+    First, images, odometry and gyroscope are compared: a contradiction is an error, or with `force`
+    a warning. An interrupted training leaves a checkpoint beside the output; `resume` continues
+    from it and gives the same bytes (the engine mdp starts again). Raises BagError, ConfigError,
+    DataError or ModelError; then no model is written.
     """
     recipe, output = recipe or Recipe(), Path(output)
     cache = image_folder(output)
@@ -100,13 +96,13 @@ def learn_place(
 ) -> Trained:
     """Steps 4 to 8 for a trained network.
 
-    Raises DataError; `strict` also for a single route, of which else a warning says so.
+    Raises DataError; with `strict` also for a single route, which otherwise is a warning.
     """
     return _learn(network, TrainingInput.of(runs, recipe), strict)
 
 
 def _maps(given: TrainingInput, images: ImageFeatures, strict: bool) -> tuple[Segments, Maps]:
-    """Steps 5 to 7, once more where measured points are given."""
+    """Steps 5 to 7; measured points repeat them in the frame of the points."""
     config, seed = given.recipe.metric, given.recipe.network.seed
     sign = -1.0 if given.panorama.clockwise else 1.0
 
@@ -128,20 +124,20 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     segments, (first, turned, result) = _maps(given, images, strict)
     given.say(8, 'choose keyframes, and check the map')
     sphere = given.recipe.panorama.sphere
-    known = learn_keyframes(given.views, segments, result, sphere, TURN_RADIUS_M)
-    result = replace(result, forecast=result.forecast.improved(known.improvement))
+    keyframe_map = learn_keyframes(given.views, segments, result, sphere, TURN_RADIUS_M)
+    result = replace(result, forecast=result.forecast.improved(keyframe_map.improvement))
     quality: dict[str, Any] = {'features_used': first.map.features, 'turned': turned is not None}
     quality |= {'delta': network.deltas[-1].tolist(), 'rank': [*map(list, network.ranks)]}
     quality |= segments.anchors.quality(result.points) if segments.anchors else {}
-    quality |= {**images.quality, **segments.quality, **result.quality, **known.quality}
+    quality |= {**images.quality, **segments.quality, **result.quality, **keyframe_map.quality}
     model = PlaceModel(
         network,
         result.map,
         given.panorama,
-        known.keyframes,
+        keyframe_map.keyframes,
         turned,
         quality,
-        known.correlation,
+        keyframe_map.correlation,
         rig_of(given.drives, segments),
     )
     return Trained(model, given.runs, images.slow, segments, result)

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What all steps of a training share: settings, and drives with clocks and loop closures."""
+"""The input of a training: recipe, compared sources of motion, drives with loop closures."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from sfa_localization.sfa.zero_time_edges import edges_between
 logger = logging.getLogger(__name__)
 
 STEPS = 8
-"""Of a training, see training.py."""
+"""Number of steps of a training; training.py lists them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recipe(ReadingRecipe):
-    """Everything that decides what is learned from a bag.
+    """All settings that decide what is learned from a bag.
 
     `architecture` replaces the standard network for the size of the panoramas.
     """
@@ -53,7 +53,7 @@ class Recipe(ReadingRecipe):
 
 @dataclass(frozen=True, slots=True)
 class TrainingInput:
-    """Drives with clocks and loop closures, the `views` that these are found by, and settings."""
+    """Drives with camera clocks and loop closures, the `views` that show them, and the recipe."""
 
     drives: Drives
     views: Views
@@ -62,7 +62,7 @@ class TrainingInput:
 
     @classmethod
     def of(cls, runs: Sequence[Run], recipe: Recipe, progress: bool = False) -> TrainingInput:
-        """Step 2: what images show before anything is learned, also in different lights."""
+        """Step 2: level the images, find loop closures, and with them calibrate the odometry."""
         total = sum(len(run.panoramas) for run in runs)
         with progress_bar(titled(2, 'level the images'), shown=progress) as bar:
             runs = leveled_runs(runs, recipe.panorama.sphere, bar.update)
@@ -71,59 +71,58 @@ class TrainingInput:
         closures = find_closures(views, recipe.panorama.clockwise)
         runs = same_scale(runs, closures)
         points = points_of(runs, recipe.metric.anchors)
-        by_tf = [run.camera for run in runs if run.camera is not None]
-        measured = complex(*recipe.metric.camera_xy) if recipe.metric.camera_xy else None
-        mount = Mount.at(by_tf[0] if by_tf and measured is None else measured)
-        items = tuple(map(drive_of, runs))
+        lever_arm = next((run.camera for run in runs if run.camera is not None), None)  # by tf
+        if recipe.metric.camera_xy:
+            lever_arm = complex(*recipe.metric.camera_xy)
+        items, mount = tuple(map(drive_of, runs)), Mount.at(lever_arm)
         drives = Drives(items, closures, recipe.segments, points=points, mount=mount)
         drives = drives.measured(views, recipe.panorama.sphere)
         return cls(drives, views, recipe, progress)
 
     @property
     def runs(self) -> tuple[Run, ...]:
-        """One for each drive."""
+        """The run of each drive."""
         return tuple(drive.run for drive in self.drives.items)
 
     @property
     def panorama(self) -> PanoramaConfig:
-        """The recipe's, in the size of the recorded ones."""
+        """The recipe's panorama, in the size of the recorded images."""
         height, width, _ = self.runs[0].panoramas.shape
         return replace(self.recipe.panorama, height=height, width=width)
 
     @property
     def architecture(self) -> Architecture:
-        """The recipe's, or the standard one for the panoramas."""
+        """The recipe's network, or the standard network for the size of the panoramas."""
         size = self.panorama.height, self.panorama.width
         normalization = self.recipe.network.normalization
         return self.recipe.architecture or standard_architecture(size, normalization)
 
     @property
     def sequences(self) -> list[ImageSequence]:
-        """What the network is trained on: the drives, and the loop closures between them."""
+        """Training data of the network: the images of each drive, and pairs at loop closures."""
         rotations, clockwise = self.architecture.rotations, self.recipe.panorama.clockwise
-        own = [ImageSequence.of(run) for run in self.runs]
-        drives = [run.panoramas for run in self.runs]
-        return own + edges_between(drives, self.drives.closures, rotations, clockwise)
+        sequences = [ImageSequence.of(run) for run in self.runs]
+        images = [run.panoramas for run in self.runs]
+        return sequences + edges_between(images, self.drives.closures, rotations, clockwise)
 
     def say(self, step: int, text: str) -> None:
-        """Announce a step."""
+        """Announce a step that has no bar."""
         announce(titled(step, text), shown=self.progress)
 
     def bar(self, step: int, text: str) -> Any:
-        """The progress of a step through all images."""
-        images = sum(len(one.panoramas) for one in self.runs)
+        """A progress bar for a step through all images."""
+        images = sum(len(run.panoramas) for run in self.runs)
         return progress_bar(titled(step, text), images, shown=self.progress)
 
 
 def train_hierarchy(given: TrainingInput, checkpoint: Checkpoint) -> Network:
-    """Step 3, section 2 of the paper; from the checkpoint where there is one."""
+    """Step 3, section 2 of the paper; continues from a checkpoint if there is one."""
     architecture, sequences = given.architecture, given.sequences
     start, seed = checkpoint.read(architecture), given.recipe.network.seed
     passes, done = 2 * len(architecture.layers), start.stages if start else 0
     title = titled(3, f'learn slow features in {passes} passes')
-    images = sum(len(one.panoramas) for one in sequences)
-    total, before = images * passes, images * done
-    with progress_bar(title, total, initial=before, shown=given.progress) as bar:
+    images = sum(len(sequence.panoramas) for sequence in sequences)
+    with progress_bar(title, images * passes, initial=images * done, shown=given.progress) as bar:
         if given.recipe.network.engine == 'mdp':
             return mdp_engine.train_network(architecture, sequences, seed, on_shard=bar.update)
         return train_network(
@@ -137,37 +136,37 @@ def train_hierarchy(given: TrainingInput, checkpoint: Checkpoint) -> Network:
 
 
 def titled(step: int, text: str) -> str:
-    """What a step does, with its number."""
+    """The title of a step, with its number."""
     return f'{text} (step {step} of {STEPS})'
 
 
 def compared(
     runs: Sequence[Run], recipe: Recipe, force: bool = False
 ) -> tuple[tuple[Run, ...], tuple[MotionCheck, ...]]:
-    """The drives with corrected sources of motion, and what these tell of each other.
+    """The drives with corrected sources of motion, and the comparison of these sources.
 
-    Raises CameraError or DataError for what cannot be right, of which `force` only warns.
+    Raises CameraError or DataError for contradictions; with `force` they are warnings.
     """
     if not force:
         require_one_view(runs)
-    shown = [turns_and_textures(run.panoramas, recipe.panorama.clockwise) for run in runs]
-    seen, textures = zip(*shown, strict=True)
-    found, checks = check_drives(runs, seen, force, textures)
-    if recipe.segments.yaw_source == 'gyro':  # that is asked for, also where others contradict it
-        found = tuple(
-            replace(one, yaw_rate=one.yaw_rate or run.yaw_rate)
-            for one, run in zip(found, runs, strict=True)
+    images = [turns_and_textures(run.panoramas, recipe.panorama.clockwise) for run in runs]
+    turns, textures = zip(*images, strict=True)
+    corrected, checks = check_drives(runs, turns, force, textures)
+    if recipe.segments.yaw_source == 'gyro':  # on request also a gyroscope that was rejected
+        corrected = tuple(
+            replace(run, yaw_rate=run.yaw_rate or recorded.yaw_rate)
+            for run, recorded in zip(corrected, runs, strict=True)
         )
-    return found, checks
+    return corrected, checks
 
 
 def drive_of(run: Run) -> Drive:
-    """A run with the clock of its camera; warns of a delay that the filter cannot compensate."""
-    seen = list(headings(run.panoramas))
-    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, seen)
+    """A run with its camera delay; warns of a delay that the filter cannot compensate."""
+    turns = list(headings(run.panoramas))
+    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, turns)
     if abs(clock.delay_ns) > DELAY_LIMIT_NS:
         logger.warning(
             '%s: the stamps of images and odometry are %.2f s apart: the filter compensates half '
             'a second only; synchronize both clocks', run.name, abs(clock.delay_s),
         )  # fmt: skip
-    return Drive(run, seen, clock.delay_ns if clock.known else None)
+    return Drive(run, turns, clock.delay_ns if clock.known else None)

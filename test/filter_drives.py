@@ -61,7 +61,7 @@ def from_rest(twists, rate_hz=50.0, standing_s=0.6, faster_s=0.4):
 
 
 @dataclass
-class Drive:
+class FilterDrive:
     """A drive to be fed to a filter: odometry in order, pictures every `every` samples; they claim
     a standard deviation of `claimed_m` and a tenth of it, or that which they have.
     """

@@ -17,7 +17,7 @@ STEP_NS = 1_000_000_000 // RATE
 
 
 @dataclass
-class Drive:
+class DriveWithTruth:
     """What a robot records, and where it was: `poses` (N, 3) at the pictures."""
 
     odometry: Odometry
@@ -41,7 +41,7 @@ def drive(twists, *, start=(0.0, 0.0, 0.0), bias=0.0, yaw_noise=0.0, speed_noise
     omega = np.interp(np.arange(len(held)), np.arange(len(held) - 1) + 0.5, measured[1:, 1])
     gyro = YawRate(stamps, omega, np.zeros(len(stamps)))
     pictures = stamps[::10]
-    return Drive(odometry, pictures, Trajectory(stamps, truth).at(pictures), gyro)
+    return DriveWithTruth(odometry, pictures, Trajectory(stamps, truth).at(pictures), gyro)
 
 
 def straight(length, speed=1.0):

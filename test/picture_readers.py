@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 import numpy as np
-from filter_drives import Drive
+from filter_drives import FilterDrive
 
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import PanoramaConfig
@@ -84,7 +84,7 @@ class Recording:
     """A drive with dark, covered, frozen, foreign and misshapen pictures, and an odometry gap."""
 
     def __init__(self):
-        drive = Drive(
+        drive = FilterDrive(
             seconds=24, rate_hz=20, every=4, start=(5.0, 60.0, 0.3),
             v_std=0.02, omega_std=0.01, position_std=0.1, yaw_std=0.03,
         )  # fmt: skip

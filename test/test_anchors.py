@@ -16,7 +16,7 @@ from cylinder_worlds import (
     run_in,
     wander,
 )
-from filter_drives import Drive as FilterDrive
+from filter_drives import FilterDrive
 from metric_worlds import drive, exact_features, grid, mixtures, stand, straight, turn
 from rosbags.typesys import Stores
 

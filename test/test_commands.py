@@ -155,7 +155,7 @@ POSES = differ(lambda o: (o.folder / 'poses.tum').read_text())
 CASES: dict[str, dict[str, Check | Case]] = {
     'simulate': {
         '--size 40x12': lambda a, b: b.bag()['pictures'].shape[1:3] == (12, 40),
-        '--trajectory curves': of_drive('truth'),
+        '--trajectory mower': of_drive('truth'),
         '--seed 2': of_drive('truth'),
         '--world 2': differ(lambda o: o.bag()['pictures'][0]),
         '--light evening': PICTURES,
@@ -172,7 +172,6 @@ CASES: dict[str, dict[str, Check | Case]] = {
         '--terrain 3': PICTURES,
         '--speed 0.5': more(lambda bag: np.ptp(bag['stamps']), 2e9),
         '--odometry-rate 20': lambda a, b: len(b.bag()['turns']) < 0.5 * len(a.bag()['turns']),
-        '--odometry-frame start': WHEELS,
         '--test-drift 1': Case(WHEELS, '--trajectory test'),
         '--scale-error 0.1': WHEELS,
         '--slip 0.3': WHEELS,

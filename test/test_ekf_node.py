@@ -9,7 +9,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
-from filter_drives import START_NS, Drive, from_rest, winding
+from filter_drives import START_NS, FilterDrive, from_rest, winding
 
 pytest.importorskip('rclpy')
 
@@ -82,7 +82,7 @@ def refused(node, topic):
 
 
 def test_live_is_offline_and_stamps_are_the_inputs(bench):
-    drive = Drive(seconds=3, **NOISY)
+    drive = FilterDrive(seconds=3, **NOISY)
     node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     heard = bench.listen(Odometry, 'ekf/odometry')
     poses = bench.listen(PoseWithCovarianceStamped, 'ekf/pose')
@@ -121,7 +121,7 @@ def test_a_lookup_in_tf_is_the_pose_of_ekf_odometry_and_there_is_one_ahead(
 ):
     """Images correct the pose; at odometry's 50 Hz, 0.1 s is a whole number of its periods."""
     monkeypatch.setattr(ekf_node, 'TFMessage', AsText)
-    drive, buffer = Drive(seconds=3, **NOISY), TransformBuffer()
+    drive, buffer = FilterDrive(seconds=3, **NOISY), TransformBuffer()
     node = bench.run(EkfNode, initial_pose=[0.3, -0.3, 0.1], transform_tolerance=tolerance_s)
     told, sent = bench.listen(Odometry, 'ekf/odometry'), bench.listen(String, '/tf')
     play(bench, node, drive)
@@ -138,7 +138,7 @@ def test_a_lookup_in_tf_is_the_pose_of_ekf_odometry_and_there_is_one_ahead(
 
 
 def test_every_measurement_gets_its_verdict(bench):
-    drive = Drive(seconds=2, **NOISY)
+    drive = FilterDrive(seconds=2, **NOISY)
     drive.seen[10, :2] += 9.0
     node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     heard = bench.listen(DiagnosticArray, 'ekf/measurement_status')
@@ -157,7 +157,7 @@ def test_every_measurement_gets_its_verdict(bench):
 
 def test_the_state_is_on_diagnostics_for_programs(bench):
     """With the level, and the keys that config/problems.md names."""
-    drive = Drive(twists=from_rest(winding(4)), **NOISY)
+    drive = FilterDrive(twists=from_rest(winding(4)), **NOISY)
     node = bench.run(EkfNode, silence_timeout=60.0)
     early = bench.listen(String, 'ekf/state', latched_qos())
     heard = bench.listen(DiagnosticArray, '/diagnostics')
@@ -193,7 +193,7 @@ def test_the_state_is_on_diagnostics_for_programs(bench):
 
 
 def test_initialpose_and_set_pose_set_the_pose(bench):
-    drive = Drive(seconds=1)
+    drive = FilterDrive(seconds=1)
     node = bench.run(EkfNode, silence_timeout=0.1, lost_std=0.5, degraded_std=0.4)
     for topic, x in (('initialpose', 7.0), ('ekf_node/set_pose', -3.0)):
         message = convert.to_pose_with_covariance([x, 1.0, math.pi], SPREAD, 1, 'map')
@@ -209,7 +209,7 @@ def test_initialpose_and_set_pose_set_the_pose(bench):
 
 
 def test_reset_and_pause(bench):
-    drive = Drive(seconds=6, **NOISY)
+    drive = FilterDrive(seconds=6, **NOISY)
     node = bench.run(EkfNode)
     play(bench, node, drive, end=1.0)
     assert bench.call(SetBool, 'ekf_node/pause', SetBool.Request(data=True)).success
@@ -263,7 +263,7 @@ def broken(message, path, value):
 
 
 def test_malformed_messages_are_counted_and_change_nothing(bench):
-    drive = Drive(seconds=1, **NOISY)
+    drive = FilterDrive(seconds=1, **NOISY)
     node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     odometries = bench.listen(Odometry, 'ekf/odometry')
     play(bench, node, drive, end=0.8)
@@ -283,7 +283,7 @@ def test_malformed_messages_are_counted_and_change_nothing(bench):
 
 def test_silence_is_reported_without_any_clock_moving(bench):
     """Messages have stopped for good: only the wall clock shows how unsure the pose is by now."""
-    drive = Drive(seconds=4, **NOISY)
+    drive = FilterDrive(seconds=4, **NOISY)
     node = bench.run(EkfNode, silence_timeout=0.2, lost_std=0.5, degraded_std=0.4)
     states = bench.listen(String, 'ekf/state', latched_qos())
     play(bench, node, drive, end=2.0)
@@ -305,7 +305,7 @@ def test_simulated_time_that_steps_back_starts_anew(bench):
         bench.publish('/clock', Clock(clock=convert.to_stamp(stamp_ns)))
         assert until(lambda s=stamp_ns: node.get_clock().now().nanoseconds == s)
         if stamp_ns == START_NS:
-            play(bench, node, Drive(seconds=0.5))
+            play(bench, node, FilterDrive(seconds=0.5))
     assert until(lambda: node.filter.counts['reset'] == 1)
 
 
@@ -324,7 +324,7 @@ def test_the_path_is_thinned_and_bounded(bench, monkeypatch):
     monkeypatch.setattr(ekf_node, 'PATH_LENGTH', 3)
     node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     heard = bench.listen(Path, 'ekf/path')
-    play(bench, node, Drive(seconds=4, rate_hz=20), kinds=[0])
+    play(bench, node, FilterDrive(seconds=4, rate_hz=20), kinds=[0])
     assert until(lambda: heard and len(heard[-1].poses) == 3)
     stamps = [read_stamp(pose.header.stamp) for pose in heard[-1].poses]
     assert np.all(np.diff(stamps) >= 500_000_000)
@@ -363,7 +363,7 @@ def test_what_the_model_knows_and_what_is_set_live_reaches_the_filter(bench, mon
     assert until(lambda: refused(node, topic) == 9)
     assert node.filter.correlation == correlation
     node.trigger_activate()
-    play(bench, node, Drive(seconds=0.5, **NOISY))
+    play(bench, node, FilterDrive(seconds=0.5, **NOISY))
     before = node.filter.state.pose
     assert node.set_parameters([Parameter('measurement_factor', value=4.0)])[0].successful
     assert node.filter.config.measurement_factor == 4.0
@@ -374,7 +374,7 @@ def test_what_the_model_knows_and_what_is_set_live_reaches_the_filter(bench, mon
 
 def test_after_an_error_inside_it_starts_anew_and_goes_on(bench, monkeypatch):
     """An error that every message would raise again does not leave the last state standing."""
-    drive = Drive(seconds=8, **NOISY)
+    drive = FilterDrive(seconds=8, **NOISY)
     node = bench.run(EkfNode)
     states = bench.listen(String, 'ekf/state', latched_qos())
     play(bench, node, drive, end=4.0)
@@ -401,7 +401,7 @@ def test_frames_are_parameters(bench):
     assert bench.node.count_publishers('/tf') == 0, 'others may broadcast the transform'
     fused = bench.listen(Odometry, 'ekf/odometry')
     transforms = bench.listen(TransformStamped, 'ekf/map_to_odom')
-    drive = Drive(seconds=1)
+    drive = FilterDrive(seconds=1)
     message = odometry(drive, 0)
     message.header.frame_id = message.child_frame_id = ''
     bench.publish('odom', message)
@@ -418,7 +418,7 @@ def test_frames_are_parameters(bench):
 
 def test_after_a_restart_it_looks_where_it_was_first(bench, tmp_path):
     pose_file = tmp_path / 'pose.json'
-    drive = Drive(seconds=3, **NOISY)
+    drive = FilterDrive(seconds=3, **NOISY)
     patient = {'pose_file': str(pose_file), 'silence_timeout': 60.0}
     node = bench.run(EkfNode, initial_pose=AT_ORIGIN, **patient)
     play(bench, node, drive)
@@ -433,7 +433,7 @@ def test_after_a_restart_it_looks_where_it_was_first(bench, tmp_path):
     assert 0.5 < again.filter.state.position_std < 1.0
     assert again.status().level.name == 'DEGRADED', 'no image has confirmed it yet'
     # Switched on elsewhere: the second image that says so is believed.
-    elsewhere = Drive(seconds=4, start=(30.0, 0.0, 1.0), **NOISY)
+    elsewhere = FilterDrive(seconds=4, start=(30.0, 0.0, 1.0), **NOISY)
     play(bench, again, elsewhere)
     assert until(lambda: len(heard) == len(elsewhere.pictures))
     assert np.hypot(*(pose_of(heard[-1]) - elsewhere.poses[elsewhere.pictures[-1]])[:2]) < 0.5

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from robustness.faults import FAULTS, NODES
 from robustness.judged import Output, head, judge, row, summary
-from robustness.recorded import World, two_laps
+from robustness.recorded import RecordedDrive, two_laps
 from robustness.replay import replayed
 
 IMAGES = [n for n in FAULTS if n.startswith(('nothing', 'images ', 'camera ', 'two '))]
@@ -51,7 +51,7 @@ def test_every_fault_changes_what_arrives():
     true = np.column_stack([0.02 * t, still])
     pictures = rng.integers(50, 200, (225, 4, 20, 3)).astype(np.uint8)
     times_ns, seen_ns = 10**18 + t * 30_000_000, 10**18 + t[:225] * 200_000_000
-    world = World(times_ns, ahead, twists, still + 1e-4, true, seen_ns, pictures)
+    world = RecordedDrive(times_ns, ahead, twists, still + 1e-4, true, seen_ns, pictures)
     plain = [pickle.dumps(message) for message in FAULTS['nothing'].messages(world)]
     for name in FAULTS.keys() - {'nothing'}:
         if 'foreign' not in name:

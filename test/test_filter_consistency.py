@@ -37,7 +37,7 @@ PICTURE_STD = np.array([0.15, 0.15, 0.04])
 
 
 @dataclass(frozen=True)
-class World:
+class FilterConditions:
     """What robots of one test have in common; `error` is how their pictures err."""
 
     speed: float
@@ -136,14 +136,14 @@ def judged(world, robot, fused):
 
 
 WORLDS = {
-    'garden': World(1.0, 50, 10, 25, ErrorCorrelation(0.7, 1.0)),
-    'fast': World(2.0, 50, 5, 20, ErrorCorrelation(0.5, 2.0)),
-    'slow, white': World(0.05, 20, 10, 80, ErrorCorrelation(0.0, 1.0)),
-    'slow, alike': World(0.05, 20, 10, 80, ErrorCorrelation(0.8, 0.3)),
-    'few messages': World(0.5, 5, 2, 60, ErrorCorrelation(0.6, 0.5)),
-    'white': World(1.0, 20, 4, 30, ErrorCorrelation(0.0, 1.0)),
-    'far alike': World(0.3, 20, 5, 40, ErrorCorrelation(0.9, 3.0)),
-    'no heading': World(0.8, 20, 5, 40, ErrorCorrelation(0.5, 1.0), heading=False),
+    'garden': FilterConditions(1.0, 50, 10, 25, ErrorCorrelation(0.7, 1.0)),
+    'fast': FilterConditions(2.0, 50, 5, 20, ErrorCorrelation(0.5, 2.0)),
+    'slow, white': FilterConditions(0.05, 20, 10, 80, ErrorCorrelation(0.0, 1.0)),
+    'slow, alike': FilterConditions(0.05, 20, 10, 80, ErrorCorrelation(0.8, 0.3)),
+    'few messages': FilterConditions(0.5, 5, 2, 60, ErrorCorrelation(0.6, 0.5)),
+    'white': FilterConditions(1.0, 20, 4, 30, ErrorCorrelation(0.0, 1.0)),
+    'far alike': FilterConditions(0.3, 20, 5, 40, ErrorCorrelation(0.9, 3.0)),
+    'no heading': FilterConditions(0.8, 20, 5, 40, ErrorCorrelation(0.5, 1.0), heading=False),
 }
 SEEDS = 20
 

@@ -7,7 +7,7 @@ import os
 
 import numpy as np
 import pytest
-from filter_drives import START_NS, Drive
+from filter_drives import START_NS, FilterDrive
 
 from sfa_localization.cli import main
 from sfa_localization.data.error_correlation import ErrorCorrelation
@@ -80,7 +80,7 @@ def tables(drive, variance=math.nan):
 
 
 def test_the_command_writes_what_the_live_filter_would_have_said(tmp_path):
-    drive = Drive(seconds=20, **NOISY, seed=1)
+    drive = FilterDrive(seconds=20, **NOISY, seed=1)
     code, (stamps, poses) = run(tmp_path, drive)
     live, said = PoseFilter(FilterConfig(), ErrorCorrelation(share=0.0)), {}
     for stamp_ns, kind, index in drive.events():
@@ -100,16 +100,16 @@ def test_the_command_writes_what_the_live_filter_would_have_said(tmp_path):
 
 
 def test_it_starts_from_a_pose_or_the_way_and_beats_the_positions(tmp_path):
-    drive = Drive(seconds=60, start=(500.0, -200.0, 2.5), **NOISY)
+    drive = FilterDrive(seconds=60, start=(500.0, -200.0, 2.5), **NOISY)
     _, found = run(tmp_path, drive)
     assert errors(drive, *found).mean() < 0.6 * alone(drive)
-    drive = Drive(seconds=10, start=(1.0, 2.0, -3.0), **NOISY)
+    drive = FilterDrive(seconds=10, start=(1.0, 2.0, -3.0), **NOISY)
     _, found = run(tmp_path, drive, *at(tmp_path, 1.0, 2.0, -3.0))
     assert len(found[0]) == len(drive.stamps_ns) and errors(drive, *found).max() < 0.6
 
 
 def test_headers_and_separators_of_all_kinds_read_alike_and_nanoseconds_survive(tmp_path):
-    drive, path = Drive(seconds=2), tmp_path / 'p.csv'
+    drive, path = FilterDrive(seconds=2), tmp_path / 'p.csv'
     for how in (
         {'head': ''}, {'head': '# a remark\nstamp_s, v_mps , omega_radps'},
         {'head': '"stamp_s","v_mps","omega_radps"'}, {'sep': '\t'},
@@ -127,7 +127,7 @@ def test_headers_and_separators_of_all_kinds_read_alike_and_nanoseconds_survive(
 
 
 def test_disorder_is_sorted_and_bad_rows_are_counted(tmp_path):
-    drive = Drive(seconds=10, **NOISY)
+    drive = FilterDrive(seconds=10, **NOISY)
     odometry, positions = write_logs(tmp_path, drive)
     head, *rows = odometry.read_text().splitlines()
     np.random.default_rng(0).shuffle(rows)
@@ -153,7 +153,7 @@ def test_a_heading_with_its_variance_starts_the_filter(tmp_path):
 
 
 def test_gaps_missing_variances_and_stamps_from_zero_or_below_are_survived():
-    drive, cut = Drive(seconds=90, rate_hz=10, every=5, **NOISY), []
+    drive, cut = FilterDrive(seconds=90, rate_hz=10, every=5, **NOISY), []
     for table, (first, last) in zip(tables(drive), ((30e9, 45e9), (50e9, 70e9)), strict=True):
         kept = abs(table.stamps_ns - START_NS - (first + last) / 2) > (last - first) / 2
         cut.append(Table(table.stamps_ns[kept], table.values[kept]))
@@ -200,13 +200,13 @@ def test_a_log_that_is_no_file_or_never_ends_and_a_wrong_start_are_one_error_lin
         assert main(['filter', str(odometry), str(positions), '--output', output]) == 1
         lines = capsys.readouterr().err.strip().splitlines()
         assert len(lines) == 1 and f'{odometry}: cannot be read' in lines[0]
-    assert run(tmp_path, Drive(seconds=1), *at(tmp_path, 1e9, 0.0, 0.0))[0] == 1
+    assert run(tmp_path, FilterDrive(seconds=1), *at(tmp_path, 1e9, 0.0, 0.0))[0] == 1
     assert 'initial_pose: 1000000000.0 is outside' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('name', ['odom.csv', 'link.csv', 'positions.csv', 'poses.tum'])
 def test_nothing_that_is_read_is_replaced(tmp_path, capsys, name):
-    logs = write_logs(tmp_path, Drive(seconds=5))
+    logs = write_logs(tmp_path, FilterDrive(seconds=5))
     (tmp_path / 'link.csv').symlink_to(logs[0])
     if name == 'poses.tum':
         logs = logs[0], logs[1].rename(tmp_path / 'poses.covariance.csv')

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from filter_drives import SECOND, START_NS, Drive, known
+from filter_drives import SECOND, START_NS, FilterDrive, known
 
 from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion.inputs import OpenLoop
@@ -38,7 +38,7 @@ def stalled(times):
 @pytest.mark.parametrize('stamped', [bursts, received, stalled])
 def test_odometry_with_poses_may_be_stamped_irregularly(stamped):
     """The poses show how far it was, whatever the stamps; images come at 8 Hz in between."""
-    drive, fused, errors = Drive(seconds=20, omega_std=0.01, v_std=0.02), PoseFilter(), []
+    drive, fused, errors = FilterDrive(seconds=20, omega_std=0.01, v_std=0.02), PoseFilter(), []
     times = np.arange(len(drive.stamps_ns)) / 50.0
     coming = [(t, 0, i) for i, t in enumerate(stamped(times).tolist())]
     coming += [(t, 1, 0) for t in np.arange(1.013, 19.0, 0.125).tolist()]
@@ -59,7 +59,7 @@ def test_odometry_with_poses_may_be_stamped_irregularly(stamped):
 
 def test_images_stamped_with_the_odometry_after_a_stall_belong_where_they_came():
     """A delay of 20 ms would put an image before all that came together, 0.4 m away."""
-    drive, fused = Drive(seconds=20, omega_std=0.01, v_std=0.02, every=7), PoseFilter()
+    drive, fused = FilterDrive(seconds=20, omega_std=0.01, v_std=0.02, every=7), PoseFilter()
     fused.expect_delay(0.02)
     for i, t in enumerate(stalled(np.arange(1000) / 50.0).tolist()):
         stamp_ns, pose = START_NS + round(t * 1e9), drive.poses[i]
@@ -71,7 +71,7 @@ def test_images_stamped_with_the_odometry_after_a_stall_belong_where_they_came()
 
 def test_a_speed_that_no_twist_says_is_not_that_of_a_stall():
     """Of odometry that fills its poses only, bundled ones show how far it was, not how fast."""
-    drive, fused = Drive(seconds=10), known()
+    drive, fused = FilterDrive(seconds=10), known()
     times = stalled(np.arange(len(drive.stamps_ns)) / 50.0)
     for t, pose in zip(times.tolist(), drive.reckoned, strict=True):
         fused.add_odometry(START_NS + round(t * 1e9), 0.0, 0.0, (0.0, 0.0), pose)
@@ -103,7 +103,7 @@ def test_equal_twists_of_a_robot_that_moves_are_commands(twists, repeats):
 
 @pytest.mark.parametrize(('noise', 'delay_s'), [(0.0, DELAY_S), (1e-3, 0.0)])
 def test_the_estimate_is_where_commands_led_a_camera_delay_ago(noise, delay_s):
-    drive, fused = Drive(twists=held(noise)), known(std=0.01)
+    drive, fused = FilterDrive(twists=held(noise)), known(std=0.01)
     fused.expect_delay(DELAY_S)
     for stamp_ns, (v, omega) in zip(drive.stamps_ns.tolist(), drive.twists.tolist(), strict=True):
         fused.add_odometry(stamp_ns, v, omega)

@@ -19,7 +19,7 @@ def smooth(rng: np.random.Generator, columns: int) -> np.ndarray:
     return normalized(np.fft.irfft(rough, columns).astype(np.float32))
 
 
-class Scene:
+class KeyframeSquare:
     """Keyframes at `places` (64, 2) m on a square of 1 m, whose textures change linearly with the
     place, and a texture `strange` that has nothing to do with it.
     """
@@ -59,7 +59,7 @@ def fit_among(image, keyframes, places, columns, channels=None, drives=None) -> 
 
 @SIZES
 def test_a_place_between_keyframes_is_found_and_a_rest_of_angle_is_no_matter_of_it(columns):
-    scene = Scene(columns)
+    scene = KeyframeSquare(columns)
     for place in ((0.0, 0.0), (0.2, -0.3), (-0.4, 0.4)):
         fit = scene.fit(place)
         assert np.allclose(fit.place, place, atol=0.01)
@@ -73,7 +73,7 @@ def test_a_place_between_keyframes_is_found_and_a_rest_of_angle_is_no_matter_of_
 
 
 def test_what_no_place_explains_is_unlike_and_moves_little_and_no_texture_is_finite():
-    scene = Scene()
+    scene = KeyframeSquare()
     for share in (0.5, 1.0):
         fit = scene.fit((0.2, 0.1), share * scene.strange)
         assert fit.unlike == pytest.approx(share**2, rel=0.3)
@@ -86,7 +86,7 @@ def test_what_no_place_explains_is_unlike_and_moves_little_and_no_texture_is_fin
 
 
 def test_keyframes_along_a_line_in_another_light_show_the_place_across_it():
-    scene, place = Scene(), (0.2, 0.3)
+    scene, place = KeyframeSquare(), (0.2, 0.3)
     light = scene.strange / 2
     line = np.column_stack([np.linspace(-0.5, 0.5, 12), np.zeros(12)])
     lit, everywhere = scene.keyframes(line, light), np.concatenate([scene.places, line])
@@ -103,7 +103,7 @@ NOISE = spectrum(2 * smooth(np.random.default_rng(9), 60))
 @pytest.mark.parametrize('spoil', [np.negative, np.zeros_like, lambda image: image + NOISE])
 def test_a_channel_that_shows_something_else_counts_little(spoil):
     """Two channels of the same scene, the second of the image spoilt."""
-    scene, place = Scene(), np.array([0.3, -0.2])
+    scene, place = KeyframeSquare(), np.array([0.3, -0.2])
     keyframes = np.concatenate([scene.kept] * 2, axis=1)
     image = np.concatenate([scene.seen(place), spoil(scene.seen(place))])
     channels = slice(0, ROWS), slice(ROWS, 2 * ROWS)
@@ -122,12 +122,12 @@ def lit(rng, columns, share):
 @SIZES
 @pytest.mark.parametrize('share', [0.1, 0.5])
 def test_the_variance_is_what_light_moves_the_place_by(columns, share):
-    scene, rng, place = Scene(columns), np.random.default_rng(7), np.array([0.1, -0.2])
+    scene, rng, place = KeyframeSquare(columns), np.random.default_rng(7), np.array([0.1, -0.2])
     fits = [scene.fit(place, lit(rng, columns, share)) for _ in range(300)]
     true = np.mean([np.sum((fit.place - place) ** 2) for fit in fits]) / 2
     assert 0.6 < np.mean([fit.variance for fit in fits]) / true < 1.7
 
 
 def test_a_place_beside_all_keyframes_is_seen_to_be():
-    inside, border, outside = (Scene().fit((x, 0.0)).outward for x in (0.0, 0.5, 1.5))
+    inside, border, outside = (KeyframeSquare().fit((x, 0.0)).outward for x in (0.0, 0.5, 1.5))
     assert inside < 0.2 and 0.5 < border < 0.9 and outside > 0.9

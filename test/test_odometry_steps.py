@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from filter_drives import SECOND, START_NS, Drive, from_rest, known, winding
+from filter_drives import SECOND, START_NS, FilterDrive, from_rest, known, winding
 
 from sfa_localization.data.odometry_steps import beyond, tolerance
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
@@ -63,7 +63,7 @@ def jumped(poses, at, way_m, turn_rad=0.0):
 def test_odometry_that_jumps_moves_nothing_and_is_told_until_an_image_comes(
     way_m, turn_rad, with_twist
 ):
-    drive = Drive(twists=winding(20, 25.0, speed=0.4), rate_hz=25)
+    drive = FilterDrive(twists=winding(20, 25.0, speed=0.4), rate_hz=25)
     twists = drive.read.copy()
     if with_twist:
         twists[251] += [way_m * 25, turn_rad * 25]
@@ -78,13 +78,13 @@ def test_odometry_that_jumps_moves_nothing_and_is_told_until_an_image_comes(
 def test_speed_that_changes_within_a_message_is_no_jump():
     """As of commands that are repeated, at 10 Hz: 0 to 2 m/s, and 0 to 2 rad/s."""
     twists = np.repeat([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0], [2.0, -2.0]], 10, axis=0)
-    drive = Drive(twists=np.tile(twists, (2, 1)), rate_hz=10)
+    drive = FilterDrive(twists=np.tile(twists, (2, 1)), rate_hz=10)
     _, outputs = fused_over(drive.reckoned, drive.read, drive)
     assert not any('jumped' in reason for *_, why in outputs for reason in why)
 
 
 def test_noisy_poses_are_no_jumps_once_their_noise_is_learned():
-    drive = Drive(twists=winding(20, 25.0, speed=0.4), rate_hz=25)
+    drive = FilterDrive(twists=winding(20, 25.0, speed=0.4), rate_hz=25)
     noise = np.random.default_rng(0).normal(0.0, 0.03, drive.reckoned.shape) * [1.0, 1.0, 0.1]
     _, outputs = fused_over(drive.reckoned + noise, drive.read, drive)
     assert not any('jumped' in ' '.join(why) for t, *_, why in outputs if t > 4)
@@ -94,7 +94,7 @@ def test_noisy_poses_are_no_jumps_once_their_noise_is_learned():
 @pytest.mark.parametrize('twist', ['fresh', 'stale', 'zero'])
 def test_a_pose_that_is_repeated_adds_nothing(times, twist):
     rate_hz = 25
-    drive = Drive(twists=from_rest(winding(20, rate_hz, speed=0.4), rate_hz), rate_hz=rate_hz)
+    drive = FilterDrive(twists=from_rest(winding(20, rate_hz, speed=0.4), rate_hz), rate_hz=rate_hz)
     renewed = np.arange(len(drive.stamps_ns)) // times * times
     twists = {'fresh': drive.read, 'stale': drive.read[renewed], 'zero': 0 * drive.read}[twist]
     _, outputs = fused_over(drive.reckoned[renewed], twists, drive, images=False)
@@ -104,10 +104,10 @@ def test_a_pose_that_is_repeated_adds_nothing(times, twist):
 
 
 def test_poses_that_are_never_filled_and_a_robot_that_stands_go_on_by_the_twist():
-    drive = Drive(twists=from_rest(winding(10)))
+    drive = FilterDrive(twists=from_rest(winding(10)))
     _, outputs = fused_over(np.zeros((500, 3)), drive.read, drive, images=False)
     assert max(error for _, error, *_ in outputs) < 1e-6
-    drive = Drive(twists=np.repeat([[0.5, 0.0], [0.0, 0.0], [0.5, 0.3]], 100, axis=0))
+    drive = FilterDrive(twists=np.repeat([[0.5, 0.0], [0.0, 0.0], [0.5, 0.3]], 100, axis=0))
     _, outputs = fused_over(drive.reckoned, drive.read, drive, images=False)
     assert max(error for _, error, *_ in outputs) < 1e-6
     assert not any('no odometry' in reason for *_, why in outputs for reason in why)
@@ -116,7 +116,7 @@ def test_poses_that_are_never_filled_and_a_robot_that_stands_go_on_by_the_twist(
 @pytest.mark.parametrize('ahead_s', [0.6, 1.0, 4.0, 30.0])
 @pytest.mark.parametrize('kind', [0, 1])
 def test_a_single_stamp_ahead_is_left_out_and_blocks_nothing(ahead_s, kind):
-    drive, errors = Drive(seconds=10, omega_std=0.01), []
+    drive, errors = FilterDrive(seconds=10, omega_std=0.01), []
     fused = known()
     for k, (stamp_ns, of, index) in enumerate(drive.events()):
         wrong = of == kind and index % 45 == 20
@@ -131,7 +131,7 @@ def test_a_single_stamp_ahead_is_left_out_and_blocks_nothing(ahead_s, kind):
 
 
 def test_a_clock_that_is_set_ahead_is_followed_from_the_third_message_on():
-    drive, fused = Drive(seconds=10), known()
+    drive, fused = FilterDrive(seconds=10), known()
     for stamp_ns, kind, index in drive.events():
         later_ns = round(3e5 * SECOND) * (stamp_ns - START_NS > 5 * SECOND)
         drive.give(fused, (stamp_ns + later_ns, kind, index), heading=True)
@@ -142,7 +142,7 @@ def test_a_clock_that_is_set_ahead_is_followed_from_the_third_message_on():
 @pytest.mark.parametrize('late_s', [-0.2, 0.1, 0.3])
 def test_a_delay_other_than_expected_is_estimated_from_the_first_turn(late_s):
     """No visual turns are given: the images' poses show it, against the motion by the wheels."""
-    drive = Drive(seconds=20, rate_hz=50)
+    drive = FilterDrive(seconds=20, rate_hz=50)
     fused, late_ns, errors = PoseFilter(), round(late_s * SECOND), []
     fused.expect_delay(0.0)
     arrives = lambda event: event[0] + event[1] * late_ns  # noqa: E731

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from filter_drives import START_NS, Drive
+from filter_drives import START_NS, FilterDrive
 
 from sfa_localization.config import SECTIONS
 from sfa_localization.data.errors import ConfigError
@@ -28,7 +28,7 @@ def believed(settings: FilterConfig) -> str:
     rng = np.random.default_rng(1)
     moving = [(1.0, 0.5 * np.sin(0.05 * i)) for i in range(1200)]
     twists = np.array(moving[:300] + [(5e-4, 1e-3)] * 40 + moving[300:])
-    trip = Drive(twists=twists, rate_hz=20.0, v_std=0.03, omega_std=0.02, position_std=0.2,
+    trip = FilterDrive(twists=twists, rate_hz=20.0, v_std=0.03, omega_std=0.02, position_std=0.2,
                  yaw_std=0.1, bias=0.01, scale=0.98)  # fmt: skip
     trip.read[300:320], trip.read[320:340] = (1.5e-3, 1e-3), (5e-4, 3e-3)
     trip.kidnap(200, (2.5, 1.5, 0.0))

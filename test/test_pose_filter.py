@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from filter_drives import NOISY, SECOND, START_NS, Drive, fed, known, seconds_of, snapshot
+from filter_drives import NOISY, SECOND, START_NS, FilterDrive, fed, known, seconds_of, snapshot
 
 from sfa_localization.data.error_correlation import LEAST_M, ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError
@@ -29,7 +29,7 @@ either = pytest.mark.parametrize('heading', [True, False])
 @either
 @pytest.mark.parametrize('start', [(3.0, -2.0, math.pi), (0, 0, -math.pi + 1e-3)])
 def test_exact_data_gives_zero_error(heading, start):
-    found = Drive(seconds=20, start=start).feed(known(start), heading)
+    found = FilterDrive(seconds=20, start=start).feed(known(start), heading)
     assert max(error for _, _, error, _ in found) < 1e-6
     assert all(update.accepted for _, update, _, _ in found)
 
@@ -37,7 +37,7 @@ def test_exact_data_gives_zero_error(heading, start):
 @pytest.mark.parametrize('speed', [1.0, -0.7, 1e-30])
 @pytest.mark.parametrize('turn', [0.0, 5e-324, 1e-7, 0.8])
 def test_exact_data_straight_turning_and_reversing(speed, turn):
-    drive, fused = Drive(twists=np.tile([speed, turn], (100, 1))), known()
+    drive, fused = FilterDrive(twists=np.tile([speed, turn], (100, 1))), known()
     assert max(error for _, _, error, _ in drive.feed(fused)) < 1e-6
     assert np.isfinite(fused.state.covariance).all()
 
@@ -45,7 +45,7 @@ def test_exact_data_straight_turning_and_reversing(speed, turn):
 @pytest.mark.parametrize('askew', [0.0, math.pi / 2, -2.0])
 def test_odometry_whose_pose_is_headed_off_its_motion_gives_way_to_its_twist(askew):
     """As of a pose in another frame than the twist, from the start or after a reset."""
-    drive, fused = Drive(seconds=10), known()
+    drive, fused = FilterDrive(seconds=10), known()
     for i, stamp_ns in enumerate(drive.stamps_ns.tolist()):
         x, y, yaw = drive.reckoned[i].tolist()
         pose = (x, y, float(wrap_angle(yaw + askew)))
@@ -54,7 +54,7 @@ def test_odometry_whose_pose_is_headed_off_its_motion_gives_way_to_its_twist(ask
 
 
 def test_prediction_to_a_stamp_recalls_and_extrapolates_less_and_less_sure():
-    drive, fused = Drive(twists=np.tile([1.0, 0.0], (200, 1))), known()
+    drive, fused = FilterDrive(twists=np.tile([1.0, 0.0], (200, 1))), known()
     drive.feed(fused, pictures=False)
     newest = int(drive.stamps_ns[-1])
     for later_s in (0.0, 0.1, -1.0):
@@ -74,7 +74,7 @@ def test_prediction_to_a_stamp_recalls_and_extrapolates_less_and_less_sure():
 @either
 @pytest.mark.parametrize('late_s', [0.5, 4.0])
 def test_shuffled_and_late_messages_give_what_messages_in_time_give(heading, late_s):
-    drive, rng = Drive(seconds=15, **NOISY), np.random.default_rng(1)
+    drive, rng = FilterDrive(seconds=15, **NOISY), np.random.default_rng(1)
     drive.seen[40:44, :2] += 3.0
     # Pictures come late, odometry up to 0.1 s: then in the order of arrival.
     arrives = {e: e[0] + rng.uniform(0, late_s if e[1] else 0.1) * 1e9 for e in drive.events()}
@@ -93,7 +93,7 @@ def test_shuffled_and_late_messages_give_what_messages_in_time_give(heading, lat
 def test_no_decision_hangs_on_a_microsecond_and_another_start_of_time_changes_no_bit(
     later_ns, moved_m, decided
 ):
-    drive, runs = Drive(seconds=40, **NOISY), []
+    drive, runs = FilterDrive(seconds=40, **NOISY), []
     drive.kidnap(200, (4.0, 1.0, 0.5))
     for shift in (lambda kind: 0, later_ns):
         fused, poses, reasons = PoseFilter(), [], []
@@ -110,7 +110,7 @@ def test_no_decision_hangs_on_a_microsecond_and_another_start_of_time_changes_no
 
 @pytest.mark.parametrize('seconds', [15, 2])
 def test_a_bag_that_loops_starts_the_filter_anew(seconds):
-    config, drive = FilterConfig(initial_pose=(0.0, 0.0, 0.0)), Drive(seconds=seconds)
+    config, drive = FilterConfig(initial_pose=(0.0, 0.0, 0.0)), FilterDrive(seconds=seconds)
     once = fed(PoseFilter(config), drive, heading=False)
     looped = fed(PoseFilter(config), drive, drive.events() * 2, heading=False)
     assert looped.counts['clock went back'] == 1
@@ -122,7 +122,7 @@ def test_a_bag_that_loops_starts_the_filter_anew(seconds):
 
 @pytest.mark.parametrize('held_s', [0.5, 2.0])
 def test_odometry_that_was_held_up_does_not_come_once_more(held_s):
-    drive = Drive(seconds=12)
+    drive = FilterDrive(seconds=12)
     held = [event for event in drive.events() if 0 <= seconds_of(event) - 6 < held_s]
     prompt = [event for event in drive.events() if event not in held]
     cut = next(i for i, event in enumerate(prompt) if event[0] > held[-1][0] + SECOND)
@@ -132,7 +132,7 @@ def test_odometry_that_was_held_up_does_not_come_once_more(held_s):
 
 
 def test_a_long_pause_of_the_recording_is_survived_and_reported():
-    drive, fused = Drive(seconds=5), known()
+    drive, fused = FilterDrive(seconds=5), known()
     drive.feed(fused)
     sure = fused.state.position_std
     for step in range(20):
@@ -143,7 +143,7 @@ def test_a_long_pause_of_the_recording_is_survived_and_reported():
 
 @pytest.mark.parametrize('apart_s', [-1e9, -7, 100])
 def test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed(apart_s):
-    drive, fused = Drive(seconds=8), known()
+    drive, fused = FilterDrive(seconds=8), known()
     for stamp_ns, kind, index in drive.events():
         drive.give(fused, (stamp_ns + kind * int(apart_s * SECOND), kind, index))
     assert fused.counts['reset'] == fused.counts['clock went back'] == 0
@@ -159,7 +159,7 @@ def test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed(apart
 
 @pytest.mark.parametrize('late_s', [0.3, -0.3, 0.9])
 def test_turns_show_by_how_much_images_are_stamped_late(late_s):
-    drive, fused, errors = Drive(seconds=90, rate_hz=25, every=4, **NOISY), PoseFilter(), []
+    drive, fused, errors = FilterDrive(seconds=90, rate_hz=25, every=4, **NOISY), PoseFilter(), []
     fused.expect(Rig(camera_delay=Quantity(0.0, 0.05)))
     late_ns = round(late_s * 1e9)
     order = sorted(drive.events(), key=lambda event: event[0] + event[1] * max(late_ns, 0))
@@ -198,7 +198,7 @@ def test_a_delay_that_turns_contradict_gives_way_and_the_pose_follows():
 
 
 def test_standing_still_neither_drifts_nor_becomes_overconfident():
-    drive, rng = Drive(seconds=5, **NOISY), np.random.default_rng(0)
+    drive, rng = FilterDrive(seconds=5, **NOISY), np.random.default_rng(0)
     fused = fed(known(), drive)
     before = fused.state
     stamp, wrong = int(drive.stamps_ns[-1]), drive.seen[-1] + [0.15, -0.15, 0.02]
@@ -214,7 +214,7 @@ def test_standing_still_neither_drifts_nor_becomes_overconfident():
 
 
 def test_covariance_stays_symmetric_positive_over_a_long_run():
-    drive, fused = Drive(seconds=120, rate_hz=20, every=4, **NOISY), known()
+    drive, fused = FilterDrive(seconds=120, rate_hz=20, every=4, **NOISY), known()
     for lap in range(3):
         for stamp_ns, kind, index in drive.events():
             drive.give(fused, (stamp_ns + lap * 120 * SECOND, kind, index), True)
@@ -226,7 +226,7 @@ def test_covariance_stays_symmetric_positive_over_a_long_run():
 
 
 def test_bias_and_scale_are_learnt():
-    drive = Drive(seconds=120, v_std=0.01, omega_std=0.005, position_std=0.1, yaw_std=0.03,
+    drive = FilterDrive(seconds=120, v_std=0.01, omega_std=0.005, position_std=0.1, yaw_std=0.03,
                   share=0.7, bias=0.01, scale=1.03)  # fmt: skip
     learning = fed(known(), drive)
     assert learning.state.yaw_rate_bias == pytest.approx(0.01, abs=0.002)
@@ -234,7 +234,7 @@ def test_bias_and_scale_are_learnt():
 
 
 def test_it_beats_images_and_odometry():
-    drive, blind = Drive(seconds=60, **NOISY), known()
+    drive, blind = FilterDrive(seconds=60, **NOISY), known()
     errors = [error for _, _, error, _ in drive.feed(known())]
     drive.feed(blind, pictures=False)
     alone = np.hypot(*(drive.seen[:, :2] - drive.poses[drive.pictures, :2]).T)
@@ -245,7 +245,7 @@ def test_stretches_of_images_that_lie_off_pull_less():
     """Errors of images have heavy tails; with all their weight they would make 0.064 m."""
     errors = []
     for seed in range(4):
-        drive = Drive(seconds=60, position_std=0.06, claimed_m=0.3, seed=seed)
+        drive = FilterDrive(seconds=60, position_std=0.06, claimed_m=0.3, seed=seed)
         rng = np.random.default_rng(seed)
         for start in rng.choice(len(drive.seen) - 10, 12, replace=False):
             drive.seen[start : start + 10, :2] += rng.normal(0, 0.4, 2)
@@ -255,7 +255,7 @@ def test_stretches_of_images_that_lie_off_pull_less():
 
 @pytest.mark.parametrize(('share', 'length_m'), [(0.3, LEAST_M), (0.7, 1e6)])
 def test_parameters_and_errors_of_the_model_change_without_losing_the_estimate(share, length_m):
-    fused, drive = known(), Drive(seconds=20, position_std=0.05, yaw_std=0.02)
+    fused, drive = known(), FilterDrive(seconds=20, position_std=0.05, yaw_std=0.02)
     drive.feed(fused, True, stop=10)
     before, correlation = snapshot(fused), ErrorCorrelation(share, length_m)
     fused.reconfigure(dataclasses.replace(fused.config, measurement_factor=4.0))
@@ -272,7 +272,7 @@ def test_parameters_and_errors_of_the_model_change_without_losing_the_estimate(s
     ((3.0, 3.0, 0.0), True), ((3.0, 3.0, 0.0), False), ((0.0, 0.0, 1.0), True),
 ])  # fmt: skip
 def test_a_spike_is_rejected_and_moves_nothing(off, heading):
-    drive = Drive(seconds=15, **NOISY)
+    drive = FilterDrive(seconds=15, **NOISY)
     drive.seen[100] = drive.seen[100] + off
     found = drive.feed(known(), heading)
     update = found[100][1]
@@ -284,7 +284,7 @@ def test_a_spike_is_rejected_and_moves_nothing(off, heading):
 def test_a_sustained_offset_is_believed_in_the_end_but_no_images_in_disagreement(
     heading,
 ):
-    drive, other = Drive(seconds=40, **NOISY), Drive(seconds=40, **NOISY)
+    drive, other = FilterDrive(seconds=40, **NOISY), FilterDrive(seconds=40, **NOISY)
     drive.seen[150:, :2] += [1.5, 0.0]
     found = drive.feed(known(), heading)
     assert not found[152][1].accepted and abs(found[-1][2] - 1.5) < 0.5
@@ -295,7 +295,7 @@ def test_a_sustained_offset_is_believed_in_the_end_but_no_images_in_disagreement
 
 @pytest.mark.parametrize(('outage', 'heading'), [(5.0, True), (30.0, True), (30.0, False)])
 def test_a_cluster_of_wrong_images_after_an_outage_is_not_trusted_at_once(outage, heading):
-    drive, fused = Drive(seconds=60, **NOISY), known()
+    drive, fused = FilterDrive(seconds=60, **NOISY), known()
     drive.feed(fused, heading, stop=15)
     first = int(np.searchsorted(drive.pictures, (15 + outage) * 50))
     drive.seen[first : first + 12, :2] += [3.0, 4.0]
@@ -320,12 +320,12 @@ def test_the_image_after_the_first_repeats_a_share_of_its_error():
 
 
 def test_one_picture_with_heading_starts_at_once_and_one_that_is_wrong_is_outvoted():
-    drive, fused = Drive(seconds=5, start=(4.0, -3.0, 2.0), **NOISY), PoseFilter()
+    drive, fused = FilterDrive(seconds=5, start=(4.0, -3.0, 2.0), **NOISY), PoseFilter()
     assert fused.state is None and fused.status.level is Level.UNINITIALISED
     found = drive.feed(fused, heading=True)
     assert found[0][1].accepted and found[0][1].reason == 'started'
     assert found[-1][2] < 0.6 and abs(found[-1][3]) < 0.2
-    drive = Drive(seconds=5, **NOISY)
+    drive = FilterDrive(seconds=5, **NOISY)
     drive.seen[0] = [9.0, 9.0, 2.0]
     found = drive.feed(PoseFilter(), heading=True)
     assert found[0][1].accepted and not found[1][1].accepted and found[3][2] < 0.8
@@ -333,7 +333,7 @@ def test_one_picture_with_heading_starts_at_once_and_one_that_is_wrong_is_outvot
 
 @pytest.mark.parametrize('seed', range(10))
 def test_without_heading_the_first_metres_start_it(seed):
-    drive = Drive(seconds=8, start=(4.0, -3.0, 2.0 + seed), **NOISY, seed=seed)
+    drive = FilterDrive(seconds=8, start=(4.0, -3.0, 2.0 + seed), **NOISY, seed=seed)
     found = drive.feed(PoseFilter())
     started = next(k for k, (_, update, _, _) in enumerate(found) if update.accepted)
     assert drive.pictures[started] / 50 < 3.0
@@ -362,7 +362,7 @@ def test_an_uncertain_image_does_not_start_the_filter(stds):
 @pytest.mark.parametrize(('heading', 'images'), [(True, 5), (False, 30)])
 def test_a_kidnapped_robot_knows_that_it_is_lost_and_recovers(heading, images, seed):
     """After five images, or three meters where they have no heading."""
-    drive, fused = Drive(seconds=30, **NOISY, seed=seed), known()
+    drive, fused = FilterDrive(seconds=30, **NOISY, seed=seed), known()
     drive.kidnap(150, (5.0, -4.0, 2.0))
     found = drive.feed(fused, heading, stop=15.6)
     error, _ = drive.error(fused, np.searchsorted(drive.stamps_ns, fused.state.stamp_ns))
@@ -381,7 +381,7 @@ def test_a_kidnapped_robot_knows_that_it_is_lost_and_recovers(heading, images, s
 def test_a_pose_from_outside_is_taken_at_any_time(stamp):
     """Also before the first message, by its own clock, and where the filter was wrong."""
     pose = (3.0, 1.0, math.pi)
-    drive = Drive(seconds=5, start=pose)
+    drive = FilterDrive(seconds=5, start=pose)
     fused = PoseFilter(FilterConfig(initial_pose=() if stamp else pose))
     if stamp == 'later':
         fused.set_pose(START_NS, (50.0, 50.0, 1.0), np.eye(3))
@@ -418,7 +418,7 @@ NOT_POSITIVE, FAST = 'covariance is not symmetric positive', 'not finite, or abs
 
 
 def test_what_cannot_be_used_is_counted_and_changes_nothing():
-    fused = fed(known(), Drive(seconds=12))
+    fused = fed(known(), FilterDrive(seconds=12))
     before, newest, counted = snapshot(fused), fused.state.stamp_ns, dict(fused.counts)
     taken = START_NS + 5 * (SECOND // 50) * (599 // 5)
     for stamp_ns, value, covariance, reason in (
@@ -450,7 +450,7 @@ def test_what_cannot_be_used_is_counted_and_changes_nothing():
 
 @pytest.mark.parametrize('variances', [(0, 0), (-1, -1), (math.nan, math.inf), (1e300, 1e3)])
 def test_unusable_variances_give_way_to_the_configured_ones(variances):
-    fused, plain, drive = known(), known(), Drive(seconds=2)
+    fused, plain, drive = known(), known(), FilterDrive(seconds=2)
     for i, stamp in enumerate(drive.stamps_ns):
         fused.add_odometry(int(stamp), *drive.read[i], variances)
         plain.add_odometry(int(stamp), *drive.read[i])
@@ -458,7 +458,7 @@ def test_unusable_variances_give_way_to_the_configured_ones(variances):
 
 
 def test_a_heading_that_is_not_known_is_left_out_and_zero_covariance_is_unknown_not_certain():
-    drive = Drive(seconds=2)
+    drive = FilterDrive(seconds=2)
     with_unknown, without = fed(known(), drive), fed(known(), drive)
     stamp, (x, y, _) = int(drive.stamps_ns[-1]) + 1, drive.poses[-1]
     flat = np.diag([0.04, 0.04, math.pi**2 / 3])
@@ -470,7 +470,7 @@ def test_a_heading_that_is_not_known_is_left_out_and_zero_covariance_is_unknown_
 
 
 def test_images_alone_carry_it_through_an_outage_of_the_odometry():
-    drive, fused = Drive(seconds=30, **NOISY), known()
+    drive, fused = FilterDrive(seconds=30, **NOISY), known()
     drive.feed(fused, heading=True, stop=10)
     images = [event for event in drive.events() if 10 <= seconds_of(event) < 20 and event[1]]
     fed(fused, drive, images)
@@ -510,7 +510,7 @@ def test_in_a_gap_of_the_odometry_its_own_pose_shows_what_else_is_uncertain():
 
 
 def test_the_state_machine_reports_why():
-    drive, fused = Drive(seconds=20, **NOISY), PoseFilter()
+    drive, fused = FilterDrive(seconds=20, **NOISY), PoseFilter()
     assert fused.status.reasons == ('no odometry and no images yet',)
     drive.feed(fused, stop=0.05)
     assert fused.status.reasons == ('no usable image yet',)

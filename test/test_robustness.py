@@ -36,7 +36,7 @@ def test_the_table_names_every_kind_of_robustness_and_tests_that_exist():
 
 pytest.importorskip('rclpy')
 
-from filter_drives import Drive  # noqa: E402
+from filter_drives import FilterDrive  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.qos import QoSProfile  # noqa: E402
@@ -177,7 +177,7 @@ def message(drive, stamp_ns, kind, index):
 
 @ros
 def test_a_replay_gives_the_same_messages_and_any_pace_the_same_estimate(bench):
-    drive = Drive(seconds=3, **NOISY)
+    drive = FilterDrive(seconds=3, **NOISY)
     slow, told = replay(bench, drive, drive.events(), 1)
     again, told_again = replay(bench, drive, drive.events(), 1)
     assert told == told_again

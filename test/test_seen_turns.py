@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres, recipe, run_in, wander
-from metric_worlds import Drive, drive, meander
+from metric_worlds import DriveWithTruth, drive, meander
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
@@ -23,7 +23,7 @@ from sfa_localization.training_input import TrainingInput
 CONFIG = SegmentConfig()
 
 
-def walk(run: Drive, noise: float, seed: int) -> np.ndarray:
+def walk(run: DriveWithTruth, noise: float, seed: int) -> np.ndarray:
     """Headings of a gyroscope of this white noise, rad per square root of s, wrapped."""
     steps = np.diff(run.stamps_ns, prepend=run.stamps_ns[0]) * 1e-9
     drift = np.cumsum(
@@ -32,7 +32,7 @@ def walk(run: Drive, noise: float, seed: int) -> np.ndarray:
     return wrap_angle(run.poses[:, 2] + drift)
 
 
-def closures_of(runs: list[Drive], count: int, seed: int = 0) -> Closures:
+def closures_of(runs: list[DriveWithTruth], count: int, seed: int = 0) -> Closures:
     """Pairs of images of each run with their true turns."""
     rng, start, pairs, turns = np.random.default_rng(seed), 0, [], []
     for run in runs:
@@ -44,7 +44,7 @@ def closures_of(runs: list[Drive], count: int, seed: int = 0) -> Closures:
     return Closures(np.concatenate(pairs), np.concatenate(turns))
 
 
-def headings_of(runs: list[Drive], noise: float, sign: float = 1.0) -> list[Headings]:
+def headings_of(runs: list[DriveWithTruth], noise: float, sign: float = 1.0) -> list[Headings]:
     tracks = [OdometryTrack.of(run.odometry, CONFIG, None) for run in runs]
     return [
         Headings.of(track, run.stamps_ns, (sign * walk(run, noise, k)).tolist())
@@ -52,7 +52,7 @@ def headings_of(runs: list[Drive], noise: float, sign: float = 1.0) -> list[Head
     ]
 
 
-def drives(yaw_noise: float) -> list[Drive]:
+def drives(yaw_noise: float) -> list[DriveWithTruth]:
     """Two drives of 200 s whose odometry turns with this white noise, rad per square root of s."""
     per_step = yaw_noise * np.sqrt(50.0)
     return [drive(meander(200.0, seed=k)[0], yaw_noise=per_step, seed=k) for k in (3, 4)]

@@ -6,7 +6,7 @@ it is.
 
 import numpy as np
 import pytest
-from filter_drives import NOISY, Drive, fed
+from filter_drives import NOISY, FilterDrive, fed
 
 from sfa_localization.fusion.smoother import Smoother
 
@@ -21,7 +21,7 @@ def distances(drive, states):
 
 @pytest.mark.parametrize('heading', [True, False])
 def test_a_smoothed_drive_is_nearer_to_the_truth(heading):
-    drive, fused, live = Drive(seconds=40, start=(3.0, -2.0, 2.9), **NOISY), Smoother(), []
+    drive, fused, live = FilterDrive(seconds=40, start=(3.0, -2.0, 2.9), **NOISY), Smoother(), []
     for event in drive.events():
         drive.give(fused, event, heading)
         if event[1] == 0 and fused.state is not None:
@@ -36,7 +36,9 @@ def test_a_smoothed_drive_is_nearer_to_the_truth(heading):
 
 
 def test_a_robot_that_stands_was_always_where_it_is_found_in_the_end():
-    drive = Drive(twists=np.zeros((500, 2)), start=(3.0, -2.0, 2.9), position_std=0.2, yaw_std=0.05)
+    drive = FilterDrive(
+        twists=np.zeros((500, 2)), start=(3.0, -2.0, 2.9), position_std=0.2, yaw_std=0.05
+    )
     states = fed(Smoother(), drive).smoothed()
     poses = np.array([state.pose for state in states])
     assert np.abs(poses - poses[-1]).max() < 1e-3
@@ -45,7 +47,7 @@ def test_a_robot_that_stands_was_always_where_it_is_found_in_the_end():
 
 
 def test_nothing_reaches_back_beyond_a_kidnapping():
-    drive = Drive(seconds=60, **NOISY)
+    drive = FilterDrive(seconds=60, **NOISY)
     drive.kidnap(len(drive.pictures) // 2, (8.0, 5.0, 1.0))
     far = distances(drive, fed(Smoother(), drive).smoothed())
     # Only until the filter noticed that it was elsewhere.
@@ -53,7 +55,7 @@ def test_nothing_reaches_back_beyond_a_kidnapping():
 
 
 def test_late_messages_are_smoothed_as_if_in_time_and_a_reset_begins_another_drive():
-    drive, fused = Drive(seconds=20, **NOISY), Smoother()
+    drive, fused = FilterDrive(seconds=20, **NOISY), Smoother()
     late = sorted(drive.events(), key=lambda event: event[0] + event[1] * 400_000_000)
     a, b = (fed(Smoother(), drive, events).smoothed() for events in (None, late))
     assert max(np.abs(x.mean - y.mean).max() for x, y in zip(a, b, strict=True)) < 1e-9

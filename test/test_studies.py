@@ -15,7 +15,7 @@ from study.comparisons import BASELINES, VARIANTS
 from study.half_real import given_drive
 from study.results import Results
 from study.retrieval import ImageRetrieval
-from study.sites import Plan
+from study.sites import SitePlan
 from study.tables import NAMES
 
 from sfa_localization.bags.reader import Bag
@@ -26,8 +26,8 @@ from sfa_localization.simulation.drive import START_NS
 from sfa_localization.simulation.settings import SimulationConfig
 
 MINUTES = dict.fromkeys(NAMES, 1)
-PLAN = Plan((6.0, 6.0), (160, 16), {'coverage': 150, 'lines': 120, 'mower': 200}, MINUTES)
-LIGHTS = light.Plan((6.0, 6.0), (160, 16), (('day', 'summer'), ('evening', 'summer')), (), 1)
+PLAN = SitePlan((6.0, 6.0), (160, 16), {'coverage': 150, 'lines': 120, 'mower': 200}, MINUTES)
+LIGHTS = light.LightPlan((6.0, 6.0), (160, 16), (('day', 'summer'), ('evening', 'summer')), (), 1)
 MONTHS = (('July', 'day', 'summer'), ('August', 'evening', 'summer'))
 
 

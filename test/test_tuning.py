@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from filter_drives import Drive
+from filter_drives import FilterDrive
 
 from sfa_localization import tuning
 from sfa_localization.data.error_correlation import ErrorCorrelation
@@ -21,7 +21,7 @@ from sfa_localization.tuning import TuningDrive
 
 def tuning_drive(claimed=0.2, true=0.2, truth=True):
     """A drive whose images err by `true` m and claim a standard deviation of `claimed` m."""
-    drive = Drive(seconds=40, rate_hz=20, every=4, v_std=0.02, omega_std=0.01,
+    drive = FilterDrive(seconds=40, rate_hz=20, every=4, v_std=0.02, omega_std=0.01,
                   position_std=true, yaw_std=0.05, share=0.7)  # fmt: skip
     variances = np.tile([4e-4, 1e-4], (len(drive.stamps_ns), 1))
     spread = np.diag([claimed**2, claimed**2, 0.05**2])

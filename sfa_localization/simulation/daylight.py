@@ -1,11 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The light of an hour in the simulated garden: where the sun stands, its color, the sky's, and
-what the camera makes of it.
+"""Daylight of the simulated garden: sun, ambient light, sky, and exposure of the camera.
 
-Colors are BGR. Those of sun and ambient light are linear, what a white surface sends back; those of
-the sky are display brightness, the square root of the light. Day is the light that a garden has
-without a choice, seen with a fixed exposure; in all others the camera meters every image.
+Colors are BGR: of sun and ambient light the linear light of a white surface, of the sky display
+brightness, the square root of the light. Day is the default, with a fixed exposure; in all other
+lights the camera meters every image.
 """
 
 from __future__ import annotations
@@ -20,18 +19,18 @@ from sfa_localization.simulation.textures import Floats, SkyLook
 Color = tuple[float, float, float]
 
 MEAN_BRIGHTNESS = 109.0
-"""Gray levels that a metering camera aims at: the mean of the default panoramas by day."""
+"""Mean gray level of metered images: that of the default panoramas by day."""
 WHITE_BALANCE = 0.6
-"""Share of a light's cast, as an exponent, that the camera takes out: evening stays warm."""
+"""Exponent of the color cast that the white balance removes; the evening stays warm."""
 
 
 @dataclass(frozen=True, slots=True)
 class Daylight:
-    """One hour: the sun, the light from everywhere else, the sky, and how the camera meters.
+    """Light of the sun, ambient light, sky, and exposure of the camera.
 
-    The sun stands `turn_deg` counterclockwise of the garden's own azimuth, at `elevation_deg` or,
-    without one, at the garden's own. `brightness` is the mean gray level of the metered images,
-    None for a fixed exposure.
+    The sun stands `turn_deg` counterclockwise of the azimuth that the garden drew, at
+    `elevation_deg` or, if None, at the elevation that it drew. `brightness` is the mean gray level
+    of metered images, None for a fixed exposure.
     """
 
     sun: Color = (1.04, 1.21, 1.30)
@@ -42,7 +41,7 @@ class Daylight:
     brightness: float | None = MEAN_BRIGHTNESS
 
     def toward_sun(self, rng: np.random.Generator) -> Array:
-        """Unit vector (3,) in the frame `world`; `rng` draws the garden's own sun."""
+        """Unit vector (3,) toward the sun in the frame `world`; `rng` draws the garden's sun."""
         azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(32, 52))
         if self.elevation_deg is not None:
             elevation = np.radians(self.elevation_deg)
@@ -52,7 +51,7 @@ class Daylight:
 
     @property
     def balance(self) -> Floats:
-        """Factor (3,) of the BGR display brightness by the camera's white balance."""
+        """Factor (3,) of the BGR display brightness, the camera's white balance."""
         if self.brightness is None:
             return np.ones(3, np.float32)
         cast = _illuminant(self) / _illuminant(LIGHTS['day'])

@@ -1,17 +1,16 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A robot drives through a simulated garden and records what its sensors measure.
+"""A robot drives through a simulated garden and records its sensors.
 
-All that is random follows from the seeds of the garden and of the drive: same seeds, same bytes.
+The seeds of the garden and of the drive decide all that is random: same seeds, same bytes.
 """
 
 from __future__ import annotations
 
 import heapq
 import os
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -41,27 +40,25 @@ SLIP_TIME_S = 2.0  # correlation time of the wheels' slip: some meters of grass
 GYRO_BIAS_TIME_S = 40.0  # correlation time of the gyroscope's wandering bias
 LIGHT_TIME_S = 30.0  # correlation time of sun, exposure and tone: a cloud passes
 
-Entry = tuple[int, Callable[[], None]]
-
-# The errors that make odometry drift, and how they are scaled to a wanted drift.
+# The errors that are scaled until the odometry drifts as much as `test_drift` asks.
 _DRIFT_ERRORS = ('scale_error', 'slip', 'gyro_bias')
-_DRIFT_ITERATIONS = 3  # the drift grows almost linearly with the errors, so a few are enough
-_DRIFT_FACTOR_MAX = 5.0  # in each iteration, so that a drive lucky to drift little stays sane
-_NO_DRIFT_M = 0.01  # below it no factor is meaningful
+_DRIFT_ITERATIONS = 3  # a few suffice, since the drift is almost linear in the errors
+_DRIFT_FACTOR_MAX = 5.0  # in each iteration
+_NO_DRIFT_M = 0.01  # a smaller drift cannot be scaled
 ROUTE_STREAM, SENSOR_STREAM, LIGHT_STREAM, PIXEL_STREAM, FRAME_STREAM, GROUND_STREAM = range(6)
-# The robot may have been switched on this far from where the recording starts.
-_FRAME_REACH_M = 50.0
+_FRAME_REACH_M = 50.0  # largest distance from the odometry frame to the start of the recording
 WAVES, WAVES_M = 12, (1.5, 6.0)
-"""Of the ground, and their lengths: shorter ones a robot bridges."""
+"""Number of waves that make up uneven ground, and their lengths: a robot bridges shorter ones."""
 SWAY = 0.25
-"""Of the slopes, what is new in each image."""
+"""Random tilt of each image as a share of the slope."""
+RENDERED_AT_ONCE = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
-    """A recorded drive: the truth in frame `world`, the measurements, the stamps of the images.
+class SimulatedDrive:
+    """A drive: the truth in frame `world`, the measurements, and the stamps of the images.
 
-    A robot without a gyroscope has no `yaw_rate`.
+    `yaw_rate` is None without a gyroscope.
     """
 
     truth: Trajectory
@@ -76,13 +73,13 @@ class Drive:
 
 
 def random_stream(config: SimulationConfig, stream: int, item: int = 0) -> np.random.Generator:
-    """The generator of one kind of randomness of one drive."""
+    """The random generator of a drive for one of the purposes *_STREAM."""
     drive_index = list(ROUTES).index(config.trajectory)
     return np.random.default_rng([config.seed, config.world, drive_index, stream, item])
 
 
-def drive(garden: Garden, config: SimulationConfig) -> Drive:
-    """Plan the route of `config`, drive it from the dock and measure; no images are made."""
+def drive(garden: Garden, config: SimulationConfig) -> SimulatedDrive:
+    """Plan and drive the route of `config` from the dock, and measure; images are not rendered."""
     lawn = Lawn(garden.half, garden.obstacles)
     plan = ROUTES[config.trajectory]
     route = plan(lawn, garden.dock, random_stream(config, ROUTE_STREAM), config.length)
@@ -91,22 +88,16 @@ def drive(garden: Garden, config: SimulationConfig) -> Drive:
     if config.trajectory == 'test' and config.test_drift > 0:
         config = _drifting(truth, twists, config)
     measured, variances = _measured(twists, config, random_stream(config, SENSOR_STREAM))
-    poses = integrate(stamps, measured, _odometry_start(config))
+    rng = random_stream(config, FRAME_STREAM)
+    start = [*rng.uniform(-_FRAME_REACH_M, _FRAME_REACH_M, 2), rng.uniform(-np.pi, np.pi)]
+    poses = integrate(stamps, measured, np.array(start))
     odometry = Odometry(stamps, poses, measured, variances)
     gyro = YawRate(stamps, measured[:, 1], variances[:, 1])
-    return Drive(truth, odometry, gyro, _image_stamps(stamps, twists, imaging, config))
-
-
-def _odometry_start(config: SimulationConfig) -> Array:
-    """Pose (3,) of the robot in the odometry frame when the recording starts."""
-    if config.odometry_frame == 'start':
-        return np.zeros(3)
-    rng = random_stream(config, FRAME_STREAM)
-    return np.array([*rng.uniform(-_FRAME_REACH_M, _FRAME_REACH_M, 2), rng.uniform(-np.pi, np.pi)])
+    return SimulatedDrive(truth, odometry, gyro, _image_stamps(stamps, twists, imaging, config))
 
 
 def _motion(route: Route, config: SimulationConfig) -> tuple[Stamps, Array, Array]:
-    """Stamps (N,), true twists (N, 2) held since the last stamp, 1 where images are taken (N,)."""
+    """Stamps (N,), true twists (N, 2) since the last stamp, and 1 where images are taken (N,)."""
     dt_ns = round(1e9 / config.odometry_rate)
     rest = Motion(np.zeros((1, 2)), images=False)
     motions = [rest, *route, rest]
@@ -145,9 +136,9 @@ def _profile(distance: float, speed: float, acceleration: float, dt: float) -> A
 
 
 def _drifting(truth: Trajectory, twists: Array, config: SimulationConfig) -> SimulationConfig:
-    """The same errors of wheels and gyroscope, scaled to drift by `config.test_drift` on average.
+    """The config with errors of wheels and gyroscope scaled to a mean drift of `test_drift`.
 
-    Errors as drawn make some test drives nearly perfect and others useless; scaled ones compare.
+    Otherwise some test drives have almost no drift, and drives are hard to compare.
     """
     for _ in range(_DRIFT_ITERATIONS):
         measured, _ = _measured(twists, config, random_stream(config, SENSOR_STREAM))
@@ -166,9 +157,9 @@ def _measured(
 ) -> tuple[Array, Array]:
     """Measured twists (N, 2) and the variances (N, 2) of their errors.
 
-    The wheels' scale and slip err in proportion to the speed, and not at all at rest. The yaw rate
-    is a gyroscope's: scale, wandering bias, white noise. Each variance is that of one message's
-    error; the slow parts of the errors do not average out from message to message.
+    Errors of the wheels' scale and slip are proportional to the speed. The yaw rate has the scale
+    error, the wandering bias and the white noise of a gyroscope. A variance is that of the error of
+    a single message; the slow errors are correlated between messages.
     """
     dt = 1 / config.odometry_rate
     count = len(twists)
@@ -209,7 +200,7 @@ def _image_stamps(
 
 
 def lights(stamps_ns: Stamps, config: SimulationConfig) -> list[Light]:
-    """The light at each stamp: clouds before the sun, exposure and tone wander from the start."""
+    """The light at each stamp; sun, exposure and tone wander over time."""
     if not len(stamps_ns):
         return []
     rng = random_stream(config, LIGHT_STREAM)
@@ -221,38 +212,32 @@ def lights(stamps_ns: Stamps, config: SimulationConfig) -> list[Light]:
     strength = config.illumination
     sun = np.clip(1 - strength * (0.4 + 0.5 * waves[0]), 0.05, 1.2)
     exposure = np.exp(0.4 * strength * waves[1])
-    return [
-        Light(*map(float, row))
-        for row in zip(sun, exposure, 0.08 * strength * waves[2], strict=True)
-    ]
+    warmth = 0.08 * strength * waves[2]
+    return list(map(Light, sun.tolist(), exposure.tolist(), warmth.tolist()))
 
 
 def render_images(
-    garden: Garden, drive: Drive, config: SimulationConfig, view: View
+    garden: Garden, drive: SimulatedDrive, config: SimulationConfig, view: View
 ) -> Iterator[Image]:
-    """The noisy images of a drive in order, rendered ahead by a thread per core."""
-    jobs = zip(drive.image_poses, lights(drive.image_stamps_ns, config), strict=True)
-    take = partial(_take, garden, config, view)
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        try:
-            yield from _ahead(pool, (partial(take, i, *job) for i, job in enumerate(jobs)))
-        finally:
-            pool.shutdown(cancel_futures=True)
+    """The noisy images of a drive in order, rendered by a thread per core."""
+    poses, light = drive.image_poses, lights(drive.image_stamps_ns, config)
 
+    def take(index: int) -> Image:
+        pose = poses[index]
+        if config.terrain:
+            pose = np.append(pose, roll_and_pitch(pose, config, index))
+        image = garden.image(pose, view, light[index])
+        rng = random_stream(config, PIXEL_STREAM, index)
+        noise = rng.standard_normal(image.shape, dtype=np.float32)
+        return rounded(image + np.float32(config.image_noise) * noise)
 
-def _take(
-    garden: Garden, config: SimulationConfig, view: View, index: int, pose: Array, light: Light
-) -> Image:
-    if config.terrain:
-        pose = np.append(pose, roll_and_pitch(pose, config, index))
-    image = garden.image(pose, view, light)
-    rng = random_stream(config, PIXEL_STREAM, index)
-    noise = rng.standard_normal(image.shape, dtype=np.float32)
-    return rounded(image + np.float32(config.image_noise) * noise)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for start in range(0, len(poses), RENDERED_AT_ONCE):
+            yield from pool.map(take, range(len(poses))[start : start + RENDERED_AT_ONCE])
 
 
 def roll_and_pitch(pose: Array, config: SimulationConfig, index: int) -> Array:
-    """Roll and pitch (2,) rad at a pose (3,), by waves of the ground of the garden, and bounce."""
+    """Roll and pitch (2,) rad at a pose (3,): the slope of the garden's ground, and sway."""
     rng = np.random.default_rng([config.world, GROUND_STREAM])
     toward, phase = rng.uniform(0, 2 * np.pi, (2, WAVES))
     along = np.cos(toward) * pose[0] + np.sin(toward) * pose[1]
@@ -262,24 +247,13 @@ def roll_and_pitch(pose: Array, config: SimulationConfig, index: int) -> Array:
     return np.asarray(np.radians(config.terrain) * (sway + np.array([uphill.imag, -uphill.real])))
 
 
-def _ahead(pool: ThreadPoolExecutor, jobs: Iterator[Callable[[], Image]]) -> Iterator[Image]:
-    """Results in order; only a few jobs run ahead, so that memory stays small."""
-    waiting: deque[Future[Image]] = deque()
-    for job in jobs:
-        waiting.append(pool.submit(job))
-        if len(waiting) > 8:
-            yield waiting.popleft().result()
-    while waiting:
-        yield waiting.popleft().result()
-
-
 def simulate(
     config: SimulationConfig,
     out: Path,
     panorama: PanoramaConfig | None = None,
     progress: bool = False,
-) -> Drive:
-    """Drive through the garden of `config` and `record` it. Returns what was recorded."""
+) -> SimulatedDrive:
+    """Drive through the garden of `config`, and record the drive to the bag `out`; see `record`."""
     garden = Garden(config.world, config)
     driven = drive(garden, config)
     record(driven, garden, config, out, panorama, progress)
@@ -287,7 +261,7 @@ def simulate(
 
 
 def record(
-    driven: Drive,
+    driven: SimulatedDrive,
     garden: Garden,
     config: SimulationConfig,
     out: Path,
@@ -299,11 +273,9 @@ def record(
     Raises BagError when the bag exists or cannot be written, ConfigError for impossible settings.
     After an error or Ctrl-C nothing is left.
     """
-    if config.images == 'panorama':
-        view = panorama_view(panorama or PanoramaConfig())
-    else:
-        camera = make_camera(LensCalibration(), RAW_SIZE)
-        view = raw_view(camera.unproject, camera.size)
+    view = panorama_view(panorama or PanoramaConfig())
+    if config.images == 'raw':
+        view = raw_view(make_camera(LensCalibration(), RAW_SIZE).unproject, RAW_SIZE)
     with BagWriter(out, config.storage) as bag:
         noisy = render_images(garden, driven, config, view)
         count = len(driven.image_stamps_ns)
@@ -311,7 +283,9 @@ def record(
         _write(bag, driven, shown, config)
 
 
-def _write(bag: BagWriter, drive: Drive, frames: Iterable[Image], config: SimulationConfig) -> None:
+def _write(
+    bag: BagWriter, drive: SimulatedDrive, frames: Iterable[Image], config: SimulationConfig
+) -> None:
     """Write all messages in the order of their stamps."""
     compressed = None if config.compression == 'none' else config.compression
     topic = '/panorama' if config.images == 'panorama' else '/image_raw'
@@ -332,7 +306,7 @@ def _write(bag: BagWriter, drive: Drive, frames: Iterable[Image], config: Simula
 
 def _entries(
     write: Callable[..., None], topic: str, stamps_ns: Stamps, *columns: Iterable[Any]
-) -> Iterator[Entry]:
-    """What writes each message of a topic, by its stamp."""
+) -> Iterator[tuple[int, Callable[[], None]]]:
+    """Stamp of each message of a topic, and a function that writes it."""
     for stamp, *values in zip(map(int, stamps_ns), *columns, strict=True):
         yield stamp, partial(write, topic, stamp, *values)

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated garden: what grows and stands where, all drawn from a world seed.
+"""A simulated garden, drawn from a world seed.
 
 The robot drives in a rectangle of lawn about the origin of the frame `world`; a strip of plants
 surrounds it, then hedges, fences and walls, then the neighbors' trees and houses.
@@ -14,13 +14,11 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from sfa_localization.camera.lenses import CameraModel
-from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.simulation.daylight import LIGHTS
-from sfa_localization.simulation.rendering import Light, Scene, Shape, View, panorama_view, raw_view
+from sfa_localization.simulation.rendering import Light, Scene, Shape, View
 from sfa_localization.simulation.seasons import in_season
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.simulation.textures import Floats
@@ -28,11 +26,11 @@ from sfa_localization.simulation.textures import Floats
 Tint = tuple[float, float, float]
 
 STRIP_M = 0.9
-"""From the driven area to the nearest plant; the robot's center may reach the area's edge."""
+"""Distance from the driven area, which the robot's center may reach, to the nearest plant."""
 FENCE_M = 2.3
-"""From the driven area to the hedges and fences around it."""
+"""Distance from the driven area to the hedges and fences around it."""
 CAMERA_HEIGHT_M = 0.45
-"""Of the mirror's focus above the lawn."""
+"""Height of the mirror's focus above the lawn."""
 
 GRASS: Tint = (0.07, 0.24, 0.13)
 BARK: Tint = (0.17, 0.25, 0.34)
@@ -99,9 +97,9 @@ def solid(mesh: trimesh.Trimesh, surface: str, tint: Tint) -> Shape:
 
 
 def bumpy(shape: Shape, rng: np.random.Generator, height: float, wavelength: float) -> Shape:
-    """The shape with its surface pushed about smoothly by some `height` in meters.
+    """The shape with smooth bumps of about `height` meters.
 
-    The push depends on the place alone, so that neighboring panels stay joined.
+    The displacement depends on the place alone, so neighboring panels stay joined.
     """
     waves = rng.standard_normal((8, 3)) * 2 * np.pi / wavelength / np.sqrt(3)
     pushes = rng.standard_normal((8, 3)) * height / np.sqrt(8)
@@ -212,18 +210,14 @@ def _gable(
         shapes.append(panel(eaves, sign * 1.06 * ahead, slope, 0.6, 'roof', tint))
     for sign in (1.0, -1.0):
         corners = base + sign * ahead / 2 + [-aside / 2, aside / 2, rise]
-        shapes.append(_triangle(corners, sign * ahead, wall))
+        normals = np.tile(sign * ahead / np.linalg.norm(ahead), (3, 1))
+        shapes.append(Shape(corners, normals, np.array([[0, 1, 2]]), *wall, np.ones(3)))
     return shapes
-
-
-def _triangle(corners: Array, outwards: Array, wall: tuple[str, Tint]) -> Shape:
-    normals = np.tile(outwards / np.linalg.norm(outwards), (3, 1))
-    return Shape(corners, normals, np.array([[0, 1, 2]]), wall[0], wall[1], np.ones(3))
 
 
 @dataclass(slots=True)
 class Plot:
-    """The garden as it is laid out: shapes, and what the robot must keep clear of.
+    """The garden while it is laid out: shapes and obstacles.
 
     `half` (2,) is half the driven area in meters; `obstacles` are discs (x, y, radius) inside it.
     """
@@ -236,11 +230,8 @@ class Plot:
     def beside(self, side: int, along: float, out: float) -> Array:
         """The point (2,) `out` meters outside the area on a side, `along` (-1..1) it."""
         reach, width = self.half[side % 2], self.half[1 - side % 2]
-        local = np.array([reach + out, along * (width + max(out, 0))])
-        turn = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[side]
-        return np.array(
-            [turn[0] * local[0] - turn[1] * local[1], turn[1] * local[0] + turn[0] * local[1]]
-        )
+        x, y = reach + out, along * (width + max(out, 0))
+        return np.array([[x, y], [-y, x], [-x, -y], [y, -x]][side])
 
     def extent(self, side: int, deep: float, wide: float) -> Array:
         """Box size (x, y) of something `deep` across and `wide` along a side."""
@@ -331,37 +322,35 @@ def trees(plot: Plot, dock: Array, on_lawn: int) -> None:
         kind = conifer if plot.rng.random() < 0.3 else tree
         plot.shapes += kind(foot, plot.rng.uniform(3.5, 7.5), plot.rng)
     for _ in range(on_lawn):
-        foot = _free_spot(plot, dock)
+        # Away from the edge of the lawn, the dock and other trees, if there is room.
+        spots = plot.rng.uniform(-1, 1, (200, 2)) * np.maximum(plot.half - 2.2, 0.5)
+        taken = np.array([dock[:2], *[obstacle[:2] for obstacle in plot.obstacles]])
+        gaps = np.linalg.norm(spots[:, None] - taken, axis=2).min(1)
+        good = np.flatnonzero(gaps > 3.0)
+        foot = spots[good[0] if len(good) else gaps.argmax()]
         plot.shapes += tree(foot, plot.rng.uniform(3.2, 4.8), plot.rng)
         plot.obstacles.append((float(foot[0]), float(foot[1]), 0.17))
 
 
-def _free_spot(plot: Plot, dock: Array) -> Array:
-    """A place on the lawn away from its edge, the dock and other trees, as far as there is room."""
-    spots = plot.rng.uniform(-1, 1, (200, 2)) * np.maximum(plot.half - 2.2, 0.5)
-    taken = np.array([dock[:2], *[obstacle[:2] for obstacle in plot.obstacles]])
-    gaps = np.linalg.norm(spots[:, None] - taken, axis=2).min(1)
-    good = np.flatnonzero(gaps > 3.0)
-    return np.asarray(spots[good[0] if len(good) else gaps.argmax()])
-
-
 class Garden:
-    """A garden of one world seed, ready to be looked at from any pose of the frame `world`.
+    """A garden of a world seed, which can be rendered from any pose of the frame `world`.
 
     `half` (2,) is half the driven area in meters, `obstacles` (N, 3) discs inside it as x, y,
-    radius, `dock` (3,) the pose that every drive starts from; `shapes` are those of the season.
-    The same in any light and season: where things stand, and so every drive.
+    radius, `dock` (3,) the start pose of every drive; `shapes` are those of the season. Places of
+    things, and so all drives, are the same in any light and season.
     """
 
     def __init__(
         self, seed: int, config: SimulationConfig | None = None, open_lawn: bool = False
     ) -> None:
-        """Lay out and light the garden; on an `open_lawn` stands no tree.
+        """Lay out and light the garden; an `open_lawn` has no trees.
 
         Raises ConfigError when the area is too small.
         """
         config = config or SimulationConfig()
-        half, daylight = _checked_half(config.area), LIGHTS[config.light]
+        if len(config.area) != 2 or min(config.area) < 6.0:
+            raise ConfigError(f'area: {config.area} needs two sides of at least 6 m')
+        half, daylight = np.array(config.area) / 2, LIGHTS[config.light]
         plot = Plot(half, np.random.default_rng([seed, 0]))
         self.dock = np.array([plot.rng.uniform(-0.5, 0.5) * half[0], 0.3 - half[1], np.pi / 2])
         for part in (lawn, border, bed, buildings):
@@ -373,17 +362,9 @@ class Garden:
         sun = daylight.toward_sun(plot.rng)
         self.scene = Scene(self.shapes, sun, np.random.default_rng([seed, 1]), daylight)
 
-    def render_panorama(self, pose: Array, panorama: PanoramaConfig) -> Image:
-        """The noiseless panorama (H, W, 3) BGR from `pose` (x m, y m, yaw rad)."""
-        return rounded(self.image(pose, panorama_view(panorama)))
-
-    def render_raw(self, pose: Array, camera: CameraModel) -> Image:
-        """The noiseless raw image (H, W, 3) BGR of a camera from `pose` (x m, y m, yaw rad)."""
-        return rounded(self.image(pose, raw_view(camera.unproject, camera.size)))
-
     def image(self, pose: Array, view: View, light: Light | None = None) -> Floats:
-        """Brightness (H, W, 3) BGR, 0..255 and beyond, of a view from a pose: x m, y m, yaw rad,
-        and perhaps roll and pitch rad.
+        """Brightness (H, W, 3) BGR, 0..255 and beyond, of a view from a pose x m, y m, yaw rad,
+        optionally with roll and pitch rad.
         """
         light = light or Light()
         position = np.array([pose[0], pose[1], CAMERA_HEIGHT_M])
@@ -393,9 +374,3 @@ class Garden:
 def rounded(image: Floats) -> Image:
     """Brightness as an image of 8 bits."""
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
-
-
-def _checked_half(area: tuple[float, ...]) -> Array:
-    if len(area) != 2 or min(area) < 6.0:
-        raise ConfigError(f'area: {area} needs two sides of at least 6 m')
-    return np.array(area) / 2

@@ -1,10 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Ray-cast images of a scene of triangles, as an omnidirectional camera sees it.
+"""Ray-cast images of a scene of triangles for an omnidirectional camera.
 
-Rays are cast on a *dome*, a grid of elevations and azimuths about the camera; an image is the
-dome resampled: into a panorama, or into the raw image of a mirror. The light of sun and sky is
-computed once for every vertex, so that an image costs one ray per point of the dome.
+Rays are cast along a *dome*, a grid of elevations and azimuths around the camera. The dome is then
+resampled to a panorama or to the raw image of a mirror. The light of sun and sky is computed once
+for every vertex, so an image costs one ray per point of the dome.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from sfa_localization.simulation.textures import (
 )
 
 BOUNCE = 0.22
-METER_ROUNDS = 4  # of metering: what is overexposed counts as white, which changes the mean
-METER_COLUMNS = 5  # every so many columns are metered
+METER_ROUNDS = 4  # iterations of metering, since overexposed pixels count as white
+METER_COLUMNS = 5  # one column of so many is metered
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Shape:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """The light of one moment: factors of the sun, of everything, and of blue and red."""
+    """The light at a moment: factors of the sun and of all light, and the tint toward red."""
 
     sun: float = 1.0
     exposure: float = 1.0
@@ -83,20 +83,20 @@ class Dome:
 
     @classmethod
     def build(cls, elevations_rad: Array, columns: int) -> Dome:
-        """Rays at the given elevations (R,), falling, and evenly spread azimuths."""
+        """Rays at falling elevations (R,) and evenly spaced azimuths."""
         azimuth = -(np.arange(columns) + 0.5 - columns / 2) * 2 * np.pi / columns
         e, a = np.meshgrid(elevations_rad, azimuth, indexing='ij')
         rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1)
         return cls(elevations_rad, columns, rays.astype(np.float32))
 
     def turned(self, yaw: float, roll: float = 0.0, pitch: float = 0.0) -> Floats:
-        """The rays (rows, columns, 3) of a robot that is turned, rolls and pitches, rad."""
+        """The rays (rows, columns, 3) in the frame `world`, by yaw, roll and pitch, rad."""
         return np.asarray(self.rays @ rotation(roll, pitch, yaw).T.astype(np.float32))
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A kind of image: the dome it needs, and how the dome becomes the image."""
+    """A kind of image: its dome, and the function that turns dome and gain into the image."""
 
     dome: Dome
     image: Callable[[Floats, Floats], Floats]
@@ -116,10 +116,10 @@ def panorama_view(config: PanoramaConfig) -> View:
 
 
 def raw_view(unproject: Callable[[Array], Array], size: tuple[int, int]) -> View:
-    """The raw image of a camera, sharp in the elevations of the default panorama.
+    """The raw image of a camera, in full resolution within the default panorama.
 
     `unproject` maps pixels (N, 2) to unit rays (N, 3) in the robot's axes, NaN where nothing is
-    visible; `size` is (rows, columns). Below the lawn's near edge the image shows the robot.
+    visible; `size` is (rows, columns). Below the dome the image shows the robot itself.
     """
     config = PanoramaConfig()
     columns, rows = np.meshgrid(np.arange(size[1]), np.arange(size[0]))
@@ -131,7 +131,7 @@ def raw_view(unproject: Callable[[Array], Array], size: tuple[int, int]) -> View
     x = (0.5 - azimuth / (2 * np.pi)) * dome.columns - 0.5 + 1
     falling = dome.elevations_rad[::-1]
     y = np.interp(elevation, falling, np.arange(len(falling))[::-1])
-    map_x, map_y = (_as_map(axis, size) for axis in (x, y))
+    map_x, map_y = (np.nan_to_num(a).reshape(size).astype(np.float32) for a in (x, y))
     below = elevation < falling[0] - np.radians(1)
     cover = np.where(np.isnan(elevation), 1.0, below).reshape(size).astype(np.float32)
     hull = np.nan_to_num(_hull(azimuth, elevation)).reshape(*size, 3)
@@ -144,12 +144,8 @@ def raw_view(unproject: Callable[[Array], Array], size: tuple[int, int]) -> View
     return View(dome, image)
 
 
-def _as_map(coordinates: Array, size: tuple[int, int]) -> Floats:
-    return np.nan_to_num(coordinates).reshape(size).astype(np.float32)
-
-
 def _rows_for(elevation: Array, config: PanoramaConfig) -> Array:
-    """Falling elevations (R,) rad: fine in the panorama's band, coarse outside of it."""
+    """Falling elevations (R,) rad: fine in the panorama's band, coarse outside."""
     step = np.radians(config.elevation_max - config.elevation_min) / config.height / 2
     top, bottom = np.radians(config.elevation_max), np.radians(config.elevation_min)
     fine = np.arange(top + 2.5 * step, bottom - 3 * step, -step)
@@ -194,19 +190,15 @@ class Scene:
         light = self._light_vertices(shapes, sun, rng)
         self._table = np.concatenate([self._corners(light), self._constants(shapes)], 1)
 
-    @property
-    def triangles(self) -> Array:
-        """All triangles (F, 3, 3) in meters."""
-        return np.asarray(self._vertices[self._faces])
-
     def _light_vertices(
         self, shapes: Sequence[Shape], sun: Array, rng: np.random.Generator
     ) -> Array:
-        """Light (V, 2) that every vertex gets from the sun and from sky and surroundings."""
+        """Light (V, 2) of every vertex from the sun, and from sky and surroundings."""
         normals = np.concatenate([shape.normals for shape in shapes])
         shade = np.concatenate([shape.shade for shape in shapes])
         start = (self._vertices + 0.03 * normals).astype(np.float32)
-        sunny = np.mean([self._free(start, _about(sun, 0.03, rng)) for _ in range(4)], 0)
+        toward = [sun + 0.03 * rng.standard_normal(3) for _ in range(4)]  # the sun is a disc
+        sunny = np.mean([self._free(start, ray) for ray in toward], 0)
         sunny *= np.clip(normals @ sun, 0, None)
         open_sky = np.mean([self._open(start, normals, rng) for _ in range(24)], 0)
         return np.stack([sunny * shade, (open_sky + BOUNCE * (1 - open_sky)) * shade], -1)
@@ -224,7 +216,7 @@ class Scene:
         return (hits < 0).astype(float)
 
     def _corners(self, light: Array) -> Floats:
-        """Per face (F, 12): texture meters and light at corner 0, and their change to 1 and 2."""
+        """Per face (F, 12): texture meters and light at corner 0, and changes to corners 1, 2."""
         corners = self._vertices[self._faces]
         normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
         axes = np.array([[1, 2], [0, 2], [0, 1]])[normal.argmax(1)]
@@ -280,9 +272,9 @@ class Scene:
 
 
 def metered(image: Floats, dome: Dome, target: float) -> Floats:
-    """The image of a dome exposed so that the default panorama's band has the mean gray `target`.
+    """The image of a dome, exposed to the mean gray `target` in the band of the default panorama.
 
-    What is too bright for the camera counts as white.
+    Overexposed pixels count as white.
     """
     config, degrees = PanoramaConfig(), np.degrees(dome.elevations_rad)
     band = (degrees <= config.elevation_max) & (degrees >= config.elevation_min)
@@ -291,8 +283,3 @@ def metered(image: Floats, dome: Dome, target: float) -> Floats:
     for _ in range(METER_ROUNDS):
         gain *= target / max(float(np.minimum(gain * seen, 255).mean()), 1e-3)
     return np.asarray(image * np.float32(gain))
-
-
-def _about(direction: Array, spread: float, rng: np.random.Generator) -> Array:
-    """A direction (3,) near the given one: the sun is no point."""
-    return direction + spread * rng.standard_normal(3)

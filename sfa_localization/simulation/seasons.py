@@ -1,8 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The plants of the simulated garden in their season: color, and how many leaves are left.
+"""Seasons of the simulated garden: colors and leaves of its plants.
 
-Summer is how a garden is laid out. Nothing but plants changes, and no plant moves.
+A garden is laid out in summer; a season changes only plants, and moves none.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ STRAW: tuple[Tint, ...] = ((0.13, 0.30, 0.33),)
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a season does to a kind of plant: the share of one of the BGR `tints` in its color,
-    drawn up to `share` for each plant, and the share of its surface that is `bare`.
+    """The effect of a season on a kind of plant: each plant mixes one of the BGR `tints` into its
+    color, by a share drawn from the range `share`, and loses the part `bare` of its leaves.
     """
 
     tints: tuple[Tint, ...]
@@ -66,5 +66,5 @@ def _changed(shape: Shape, change: Change, rng: np.random.Generator) -> Shape:
     share = rng.uniform(*change.share)
     tint = change.tints[rng.integers(len(change.tints))]
     b, g, r = (1 - share) * np.array(shape.tint) + share * np.array(tint)
-    left = rng.random(len(shape.faces)) >= change.bare
-    return replace(shape, tint=(float(b), float(g), float(r)), faces=shape.faces[left])
+    leaves = rng.random(len(shape.faces)) >= change.bare
+    return replace(shape, tint=(float(b), float(g), float(r)), faces=shape.faces[leaves])

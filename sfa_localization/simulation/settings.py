@@ -16,16 +16,14 @@ class SimulationConfig(Settings):
     trajectory: str = setting(
         'coverage',
         'coverage (criss-crossing straight legs), lines (straight lines, no images between), '
-        'mower (a grid of lanes), test (one smooth closed curve), curves (wandering, no straight '
-        'line)',
-        choices=('coverage', 'lines', 'mower', 'test', 'curves'),
+        'mower (a grid of lanes), test (one smooth closed curve)',
+        choices=('coverage', 'lines', 'mower', 'test'),
     )
     seed: int = setting(1, 'drive, sensor errors and light', low=0, high=2**63 - 1)
     world: int = setting(1, 'garden', low=0, high=2**63 - 1)
     light: str = setting(
         'day',
-        'sun, sky and what the camera makes of them: day (fixed exposure), morning, overcast, '
-        'evening (automatic exposure and white balance)',
+        'day (fixed exposure), morning, overcast, evening (automatic exposure, white balance)',
         choices=('day', 'morning', 'overcast', 'evening'),
     )
     season: str = setting(
@@ -35,7 +33,7 @@ class SimulationConfig(Settings):
         (16.0, 18.0), 'driven area along x and y', unit='m', low=6.0, high=100.0
     )
     length: float = setting(
-        0.0, 'length of coverage, test and curves; 0: by the area', unit='m', low=0.0, high=1e5
+        0.0, 'length of coverage and test; 0: by the area', unit='m', low=0.0, high=1e5
     )
     images: str = setting(
         'raw', 'image of the mirror, or the panorama itself', choices=('raw', 'panorama')
@@ -61,35 +59,18 @@ class SimulationConfig(Settings):
     odometry_rate: float = setting(
         50.0, 'rate of odometry, gyroscope and ground truth', unit='Hz', low=5.0, high=500.0
     )
-    odometry_frame: str = setting(
-        'random',
-        'where the odometry frame lies: anywhere, as of a robot that was switched on earlier, or '
-        'at the start of the recording',
-        choices=('random', 'start'),
-    )
     test_drift: float = setting(
-        0.31,
-        "mean odometry error of a test drive, the paper's robot's; 0: as the errors are drawn",
-        unit='m',
-        low=0.0,
-        high=10.0,
+        0.31, 'mean odometry error of a test drive; 0: as drawn', unit='m', low=0.0, high=10.0
     )
     scale_error: float = setting(
-        0.005,
-        "standard deviation of a run's scale errors of wheel radius and gyroscope",
-        low=0.0,
-        high=0.2,
+        0.005, 'standard deviation of the scales of wheels and gyroscope', low=0.0, high=0.2
     )
     slip: float = setting(
         0.02, 'standard deviation of wheel slip, correlated over about 2 s', low=0.0, high=0.5
     )
     speed_noise: float = setting(0.01, 'white noise of the speed', unit='m/s', low=0.0, high=1.0)
     gyro_bias: float = setting(
-        0.0016,
-        'standard deviation of the wandering gyroscope bias',
-        unit='rad/s',
-        low=0.0,
-        high=0.1,
+        0.0016, 'standard deviation of the gyroscope bias', unit='rad/s', low=0.0, high=0.1
     )
     gyro_noise: float = setting(
         0.005, 'white noise of the yaw rate', unit='rad/s', low=0.0, high=1.0

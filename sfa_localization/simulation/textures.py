@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Procedural textures of the simulated garden: tileable surfaces with mip levels, and the sky.
 
-All values are display brightness, the square root of the light that a surface sends back; images
-are BGR. A surface's texture covers PERIOD_M by PERIOD_M meters and repeats without a seam.
+Values are display brightness, the square root of reflected light; images are BGR. The texture of a
+surface covers PERIOD_M by PERIOD_M meters and repeats without a seam.
 """
 
 from __future__ import annotations
@@ -43,35 +43,13 @@ def noise(
 
 
 def _colored(brightness: Floats, hue: Floats | float = 0.0) -> Floats:
-    """Stack to BGR; positive `hue` leans from green-blue to yellow-red."""
+    """Stack to BGR; a positive `hue` makes it redder, a negative one bluer."""
     blue, green, red = brightness - hue, brightness + 0 * hue, brightness + hue
     return np.stack(np.broadcast_arrays(blue, green, red), -1).astype(np.float32)
 
 
-def _grass(rng: np.random.Generator) -> Floats:
-    fine, coarse = noise(rng, 20, 220), noise(rng, 2, 14)
-    return _colored(0.76 + 0.09 * fine + 0.05 * coarse, 0.035 * noise(rng, 2, 40))
-
-
-def _leaves(rng: np.random.Generator) -> Floats:
-    clumps, leaves = noise(rng, 6, 24), noise(rng, 24, 120)
-    return _colored(0.72 + 0.12 * clumps + 0.13 * leaves, 0.04 * noise(rng, 8, 60))
-
-
-def _bark(rng: np.random.Generator) -> Floats:
-    return _colored(0.72 + 0.15 * noise(rng, 16, 160, stretch=4))
-
-
-def _plaster(rng: np.random.Generator) -> Floats:
-    return _colored(0.86 + 0.035 * noise(rng, 1, 10) + 0.03 * noise(rng, 30, 200))
-
-
-def _plain(rng: np.random.Generator) -> Floats:
-    return _colored(0.85 + 0.03 * noise(rng, 2, 60))
-
-
 def _cells(rng: np.random.Generator, wide: int, high: int, joint: int, shift: float) -> Floats:
-    """Rectangles of wide x high pixels of random brightness with darker joints between."""
+    """Rectangles of wide x high pixels, of random brightness, with dark joints between them."""
     row = np.arange(TILE)[:, None] // high
     column = (np.arange(TILE)[None] + (row * int(shift * wide))) % TILE
     shades = 0.80 + 0.07 * rng.standard_normal((TILE // high, TILE // wide))
@@ -80,25 +58,8 @@ def _cells(rng: np.random.Generator, wide: int, high: int, joint: int, shift: fl
     return np.asarray(np.where(gap, 0.55, cells), np.float32)
 
 
-def _boards(rng: np.random.Generator) -> Floats:
-    return _colored(_cells(rng, 16, TILE, 2, 0) + 0.06 * noise(rng, 8, 160, stretch=6))
-
-
-def _bricks(rng: np.random.Generator) -> Floats:
-    return _colored(_cells(rng, 32, 16, 2, 0.5) + 0.04 * noise(rng, 20, 160))
-
-
-def _paving(rng: np.random.Generator) -> Floats:
-    return _colored(_cells(rng, 64, 64, 3, 0) + 0.05 * noise(rng, 10, 160))
-
-
-def _roof(rng: np.random.Generator) -> Floats:
-    slope = (np.arange(TILE)[:, None] % 32) / 32
-    return _colored(_cells(rng, 32, 32, 2, 0.5) - 0.15 * slope.astype(np.float32))
-
-
 def _stones(rng: np.random.Generator) -> Floats:
-    """Rubble: the cells nearest to random points, dark where two cells meet."""
+    """Rubble: the Voronoi cells of random points, dark at their borders."""
     points = rng.uniform(0, TILE, (320, 2))
     rows, columns = np.mgrid[0:TILE, 0:TILE] + 0.5
     pixels = np.stack([rows.ravel(), columns.ravel()], -1)
@@ -109,17 +70,22 @@ def _stones(rng: np.random.Generator) -> Floats:
     return _colored(field.reshape(TILE, TILE).astype(np.float32) + 0.04 * noise(rng, 30, 160))
 
 
+_ROOF_SHADE = np.float32(0.15) * (np.arange(TILE, dtype=np.float32)[:, None] % 32 / 32)
 SURFACES: dict[str, Callable[[np.random.Generator], Floats]] = {
-    'plain': _plain,
-    'grass': _grass,
-    'leaves': _leaves,
-    'bark': _bark,
-    'boards': _boards,
-    'bricks': _bricks,
-    'plaster': _plaster,
+    'plain': lambda rng: _colored(0.85 + 0.03 * noise(rng, 2, 60)),
+    'grass': lambda rng: _colored(
+        0.76 + 0.09 * noise(rng, 20, 220) + 0.05 * noise(rng, 2, 14), 0.035 * noise(rng, 2, 40)
+    ),
+    'leaves': lambda rng: _colored(
+        0.72 + 0.12 * noise(rng, 6, 24) + 0.13 * noise(rng, 24, 120), 0.04 * noise(rng, 8, 60)
+    ),
+    'bark': lambda rng: _colored(0.72 + 0.15 * noise(rng, 16, 160, stretch=4)),
+    'boards': lambda rng: _colored(_cells(rng, 16, TILE, 2, 0) + 0.06 * noise(rng, 8, 160, 6)),
+    'bricks': lambda rng: _colored(_cells(rng, 32, 16, 2, 0.5) + 0.04 * noise(rng, 20, 160)),
+    'plaster': lambda rng: _colored(0.86 + 0.035 * noise(rng, 1, 10) + 0.03 * noise(rng, 30, 200)),
     'stones': _stones,
-    'roof': _roof,
-    'paving': _paving,
+    'roof': lambda rng: _colored(np.asarray(_cells(rng, 32, 32, 2, 0.5) - _ROOF_SHADE)),
+    'paving': lambda rng: _colored(_cells(rng, 64, 64, 3, 0) + 0.05 * noise(rng, 10, 160)),
 }
 SURFACE_INDEX = {name: index for index, name in enumerate(SURFACES)}
 
@@ -141,9 +107,9 @@ class Atlas:
         widest = np.minimum(footprint_m, texel * 2.0**LEVELS)
         level = np.clip(np.rint(np.log2(widest / texel + 1e-6)), 0, LEVELS - 1)
         side = np.exp2(-level) * TILE
-        # Widths of the wider levels to the left, and two columns of padding for each.
-        left = 2 * TILE - 2 * side + 2 * level
-        x = left + 0.5 + _fraction(u) * side
+        # The wider levels lie to the left, each with two columns of padding.
+        start = 2 * TILE - 2 * side + 2 * level
+        x = start + 0.5 + _fraction(u) * side
         y = surface * (TILE + 2) + 0.5 + _fraction(v) * side
         return np.asarray(cv2.remap(self.pixels, x, y, cv2.INTER_LINEAR), np.uint8)
 
@@ -168,8 +134,8 @@ def _strip(texture: Floats) -> Image:
 class SkyLook:
     """A sky in display brightness, BGR: `horizon`, `fall` from there up to the zenith, and clouds.
 
-    Clouds have the color `cloud`, the mean `cover` and the `contrast`; `wind` (pixels of their
-    noise) has moved them since the day. `glow` is added about the sun; `hills` are factors.
+    Clouds have a color `cloud`, a mean `cover` and a `contrast`; `wind` shifts them by pixels of
+    their noise. `glow` is added around the sun; `hills` are factors of the hills' color.
     """
 
     horizon: tuple[float, float, float] = (0.93, 0.74, 0.55)
@@ -189,8 +155,7 @@ GLOW_RAD = 0.7
 def sky(rng: np.random.Generator, look: SkyLook, sun: NDArray[np.float64]) -> Image:
     """Sky with clouds, haze and far hills: BGR (SKY_ROWS, SKY_COLUMNS, 3), highest row first.
 
-    Columns grow counterclockwise from the world's +x axis; `sun` (3,) points toward it. The hills
-    stand where they stand in every light.
+    Columns grow counterclockwise from the world's +x axis; `sun` (3,) points toward the sun.
     """
     elevation = np.linspace(SKY_HIGHEST_DEG, SKY_LOWEST_DEG, SKY_ROWS, dtype=np.float32)[:, None]
     azimuth = np.linspace(0, 2 * np.pi, SKY_COLUMNS, endpoint=False, dtype=np.float32)[None]

@@ -19,7 +19,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from metric_worlds import Drive, criss_cross, drive, garden_features, grid, meander
+from metric_worlds import DriveWithTruth, criss_cross, drive, garden_features, grid, meander
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align
@@ -45,7 +45,7 @@ KINDS = ('random', 'grid', 'pieces')
 class Problem:
     """One random problem: a drive, its segments, and features of all its pictures."""
 
-    run: Drive
+    run: DriveWithTruth
     segments: Segments
     features: np.ndarray
 

@@ -30,7 +30,7 @@ _KINDS = (Seen, Reading, Restart)
 
 
 @dataclass(frozen=True)
-class Drive:
+class FilterInput:
     """What reaches ekf_node, in the order of arrival, and what it knows of the model."""
 
     messages: list
@@ -124,7 +124,7 @@ class Frozen:
             panorama=PanoramaConfig(),
             keyframes=None,
         )
-        return Drive(messages, int(start_ns), known, RigidTransform(*transform))
+        return FilterInput(messages, int(start_ns), known, RigidTransform(*transform))
 
 
 def unpacked(kind, at_ns, stamp_ns, values):

@@ -43,7 +43,7 @@ OTHER_LIGHTS = (
 
 
 @dataclass(frozen=True)
-class World:
+class RecordedDrive:
     """What happens: times (ns) of odometry (N,) and pictures (M,), and what both show.
 
     `steps` (N, 3) are the motions since the reading before by the wheels, `true` (N, 3) the poses.
@@ -84,7 +84,7 @@ class World:
             for t in (self.seconds(self.times_ns), self.seconds(self.pictures_ns))
         )
         odometry = [getattr(self, f.name)[kept] for f in fields(self)[:5]]
-        return World(*odometry, self.pictures_ns[seen], self.pictures[seen])
+        return RecordedDrive(*odometry, self.pictures_ns[seen], self.pictures[seen])
 
     def followed_by(self, other, pause_ns=40_000_000):
         """Both, one after the other: the pose may jump between them."""
@@ -94,7 +94,7 @@ class World:
         ]
         joined[0][len(self.times_ns) :] += later
         joined[5][len(self.pictures_ns) :] += later
-        return World(*joined)
+        return RecordedDrive(*joined)
 
 
 def sources_key(rooms, *more):
@@ -197,7 +197,7 @@ def two_laps(light=RECORDED[0], season=RECORDED[1]):
     true = run.ground_truth.at(odometry.stamps_ns)
     steps = np.zeros((len(true), 3))
     steps[1:] = relative(odometry.poses[:-1], odometry.poses[1:])
-    whole = World(odometry.stamps_ns, steps, odometry.twists, odometry.variances, true,
+    whole = RecordedDrive(odometry.stamps_ns, steps, odometry.twists, odometry.variances, true,
                   run.panoramas.stamps_ns, pictures)  # fmt: skip
     # It begins with a turn on the spot, into the direction in which it ends.
     off = np.abs(relative(true[-1], true[: len(true) // 2])) @ [1.0, 1.0, 1.0]

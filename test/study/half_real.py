@@ -19,7 +19,7 @@ from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, Trajectory, integrate
 from sfa_localization.filtering import ODOMETRY, read_table
-from sfa_localization.simulation.drive import START_NS, Drive, record
+from sfa_localization.simulation.drive import START_NS, SimulatedDrive, record
 from sfa_localization.simulation.garden import Garden
 from sfa_localization.simulation.settings import SimulationConfig
 
@@ -34,7 +34,7 @@ POSE_GAP_S = 0.5
 """No image is taken where the true poses pause for longer: the robot may be anywhere between."""
 
 
-def given_drive(truth: Trajectory, odometry: Odometry, config: SimulationConfig) -> Drive:
+def given_drive(truth: Trajectory, odometry: Odometry, config: SimulationConfig) -> SimulatedDrive:
     """The drive of poses (N, 3) in frame `world` and of measured twists (M, 2); no images are made.
 
     The poses of `odometry` are not read: they follow from its twists, from zero on. Images are
@@ -61,7 +61,9 @@ def given_drive(truth: Trajectory, odometry: Odometry, config: SimulationConfig)
     if len(images) < 2:
         raise DataError('poses and odometry overlap for fewer than two images: check their clocks')
     poses = integrate(stamps, odometry.twists)
-    return Drive(truth, Odometry(stamps, poses, odometry.twists, odometry.variances), None, images)
+    return SimulatedDrive(
+        truth, Odometry(stamps, poses, odometry.twists, odometry.variances), None, images
+    )
 
 
 def _image_stamps(truth: Trajectory, config: SimulationConfig) -> Stamps:

@@ -56,7 +56,7 @@ ALL_BUT = 'all but the tested'
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class LightPlan:
     """Size of the garden (m) and of the panoramas, where to test, the lights that `ALL_BUT` is
     filled in for, and about how long it takes.
 
@@ -70,8 +70,10 @@ class Plan:
     minutes: int
 
 
-FULL = Plan((16.0, 18.0), (600, 60), tuple((li, s) for s in SEASONS for li in LIGHTS), LIGHTS, 60)
-QUICK = Plan(
+FULL = LightPlan(
+    (16.0, 18.0), (600, 60), tuple((li, s) for s in SEASONS for li in LIGHTS), LIGHTS, 60
+)
+QUICK = LightPlan(
     (8.0, 8.0),
     (300, 30),
     (*((light, 'summer') for light in LIGHTS), ('overcast', 'autumn'), ('day', 'winter')),
@@ -89,7 +91,7 @@ class Training:
     tests: tuple[Condition, ...]
 
 
-def trainings(plan: Plan) -> Iterator[Training]:
+def trainings(plan: LightPlan) -> Iterator[Training]:
     """The models of a plan: one for each row, and for `ALL_BUT` one for each light left out."""
     for trained, lights in TRAININGS.items():
         yield Training(trained, lights, plan.tests)
@@ -104,7 +106,7 @@ class _Work:
 
     out: Path
     config: StudyConfig
-    plan: Plan
+    plan: LightPlan
     progress: Progress
 
     def training(self, light: str) -> Path:
@@ -145,7 +147,7 @@ class _Work:
 
 
 def fill_matrix(
-    out: Path, config: StudyConfig, plan: Plan, *, progress: bool = False
+    out: Path, config: StudyConfig, plan: LightPlan, *, progress: bool = False
 ) -> list[Cell]:
     """Fill the matrix; write it as JSON, table and figure below `out`. Returns its cells.
 

@@ -24,7 +24,7 @@ from study.trials import Study
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class SitePlan:
     """Size of the garden (m) and of the panoramas, images of the training drives, and minutes of
     each result and seed, as measured on two cores.
     """
@@ -35,14 +35,14 @@ class Plan:
     minutes: dict[str, int]
 
 
-FULL = Plan(
+FULL = SitePlan(
     (16.0, 18.0),
     (600, 60),
     {'coverage': 1773, 'lines': 862, 'mower': 1346},
     {'simulator': 4, 'robot': 3, 'baselines': 4, 'ablations': 30},
 )
 """The sizes of section 4."""
-QUICK = Plan(
+QUICK = SitePlan(
     (8.0, 8.0),
     (300, 30),
     {'coverage': 400, 'lines': 300, 'mower': 600},
@@ -67,7 +67,7 @@ class Site:
 
     @classmethod
     def simulated(
-        cls, out: Path, experiment: str, world: int, seed: int, plan: Plan, progress: Progress
+        cls, out: Path, experiment: str, world: int, seed: int, plan: SitePlan, progress: Progress
     ) -> Site:
         """The garden `world` with drives of `seed`, below the folder `out`."""
         folder = out / f'garden_{world}_{seed}'

@@ -15,7 +15,7 @@ from study.comparisons import MEASURES, SCORES, VARIANTS, ablations, baselines
 from study.paper import experiment
 from study.paper_report import comparison_table, paper_table
 from study.results import Progress, Results, StudyConfig, settings_of
-from study.sites import ROUTES, Plan, Site
+from study.sites import ROUTES, Site, SitePlan
 
 NAMES = ('simulator', 'robot', 'baselines', 'ablations')
 
@@ -28,7 +28,7 @@ class Work:
 
     out: Path
     config: StudyConfig
-    plan: Plan
+    plan: SitePlan
     progress: Progress
     bags: tuple[Path, ...] = ()
     test: Path | None = None

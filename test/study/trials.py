@@ -21,7 +21,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.geometry import Array, RigidTransform, align, compose, invert, rotation
 from sfa_localization.data.run import Image, Run, Trajectory
-from sfa_localization.evaluation import known, score
+from sfa_localization.evaluation import has_truth, score
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.keyframes.closures import Closures
@@ -123,7 +123,7 @@ def _truth(drive: Drive) -> Trajectory:
     if truth is None:
         raise DataError(f'{drive.run.name}: no ground truth to judge by')
     poses = truth.at(stamps)
-    poses[~known(truth, stamps)] = np.nan
+    poses[~has_truth(truth, stamps)] = np.nan
     return Trajectory(stamps, poses)
 
 
