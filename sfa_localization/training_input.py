@@ -70,7 +70,7 @@ class TrainingInput:
             views = views_of(runs, bar.update)
         closures = find_closures(views, recipe.panorama.clockwise)
         runs = same_scale(runs, closures)
-        points = points_of(runs, recipe.metric.anchors)
+        points = points_of(runs, recipe.metric.points)
         by_tf = [run.camera for run in runs if run.camera is not None]
         measured = complex(*recipe.metric.camera_xy) if recipe.metric.camera_xy else None
         mount = Mount.at(by_tf[0] if by_tf and measured is None else measured)
