@@ -3,8 +3,8 @@
 """What odometry, loop closures and measured points alone say of all drives, with a certificate.
 
 The least squares of links.py, loops.py and measured_points.py in [o, z, -b z] (see stack.py),
-without features: each square reads few segments, so that Gauss and Newton's normal equations are sparse,
-and a drive of thousands of segments takes seconds. With multipliers
+without features: each square reads few segments, so that Gauss and Newton's normal equations are
+sparse, and a drive of thousands of segments takes seconds. With multipliers
 Lambda = diag(Re(conj(z) * (S x)_z)), S the quadratic form at the biases and x = [o, z] where o is
 best, S - diag(0, Lambda) >= 0 proves the directions optimal, as H - Lambda >= 0 does in phases.py:
 H is what S leaves of z. A sparse factor shows it by the signs of its pivots.

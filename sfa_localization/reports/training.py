@@ -99,7 +99,7 @@ def weak_lines(trained: Trained) -> list[str]:
     ]
     even = f'Nowhere is the expected error more than {_WEAK} times the mean.'
     uneven = f'On {share:.0%} of the covered ground it is more than {_WEAK} times the mean.'
-    frame = 'x and y are those of the odometry where the first drive starts, or start at start_pose.'
+    frame = 'x and y are those of the odometry where the first drive starts, or of start_pose.'
     if trained.segments.points is not None:
         frame = 'x and y are those of the measured points.'
     return [*lines, uneven if lines else even, frame]
