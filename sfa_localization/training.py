@@ -26,7 +26,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.fusion.motion import TURN_RADIUS_M
-from sfa_localization.metric.drives import Maps, anchored, compare_with_map, learn_map, rig_of
+from sfa_localization.metric.drives import Maps, compare_with_map, learn_map, rig_of, with_points
 from sfa_localization.metric.keyframe_map import learn_keyframes
 from sfa_localization.metric.learning import MetricResult, learn_metric, with_turned
 from sfa_localization.metric.motion_check import MotionCheck
@@ -115,7 +115,7 @@ def _maps(given: TrainingInput, images: ImageFeatures, strict: bool) -> tuple[Se
     given.say(6, 'cut the odometry, and learn the map')
     segments, first = learn_map(given.drives, images.slow, config, seed, strict)
     given.say(7, 'learn the map again, from turned maps')
-    return anchored(given.drives, segments, turned(segments, first), again)
+    return with_points(given.drives, segments, turned(segments, first), again)
 
 
 def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
@@ -128,7 +128,7 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     result = replace(result, forecast=result.forecast.improved(keyframe_map.improvement))
     quality: dict[str, Any] = {'features_used': first.map.features, 'turned': turned is not None}
     quality |= {'delta': network.deltas[-1].tolist(), 'rank': [*map(list, network.ranks)]}
-    quality |= segments.anchors.quality(result.points) if segments.anchors else {}
+    quality |= segments.points.quality(result.points) if segments.points else {}
     quality |= {**images.quality, **segments.quality, **result.quality, **keyframe_map.quality}
     model = PlaceModel(
         network,

@@ -70,7 +70,7 @@ class TrainingInput:
             views = views_of(runs, bar.update)
         closures = find_closures(views, recipe.panorama.clockwise)
         runs = same_scale(runs, closures)
-        points = points_of(runs, recipe.metric.anchors)
+        points = points_of(runs, recipe.metric.points)
         lever_arm = next((run.camera for run in runs if run.camera is not None), None)  # by tf
         if recipe.metric.camera_xy:
             lever_arm = complex(*recipe.metric.camera_xy)

@@ -180,7 +180,7 @@ def test_a_bias_that_changes_every_minute_is_found():
     assert spreads[1] < 0.7 * spreads[0]
 
 
-def test_the_map_is_the_odometry_frame_at_the_start_and_an_anchor_moves_it():
+def test_the_map_is_the_odometry_frame_at_the_start_and_a_start_pose_moves_it():
     run, segments, features, result = noisy_result()
     images, places = result.images, result.poses[:, :2]
     yaw = result.poses[:, 2]
@@ -189,13 +189,13 @@ def test_the_map_is_the_odometry_frame_at_the_start_and_an_anchor_moves_it():
     assert errors(places[start], truth[start, :2]).mean() < 0.15
     assert np.abs(wrap_angle(yaw - truth[:, 2])[start]).mean() < np.deg2rad(1.5)
     frame = RigidTransform(5.0, -2.0, 2.0)
-    anchored = learn_metric(features, segments, dataclasses.replace(GP, anchor=(5.0, -2.0, 2.0)))
+    moved = learn_metric(features, segments, dataclasses.replace(GP, start_pose=(5.0, -2.0, 2.0)))
     expected = frame.apply(result.map.predict(features)[0])
-    assert np.allclose(anchored.map.predict(features)[0], expected, atol=1e-6)
-    assert np.allclose(anchored.poses[:, :2], frame.apply(result.poses[:, :2]))
-    for anchor in ((1.0,), (1.0, 2.0, 3.0, 4.0)):
+    assert np.allclose(moved.map.predict(features)[0], expected, atol=1e-6)
+    assert np.allclose(moved.poses[:, :2], frame.apply(result.poses[:, :2]))
+    for pose in ((1.0,), (1.0, 2.0, 3.0, 4.0)):
         with pytest.raises(ConfigError, match='x, y, yaw'):
-            MetricConfig(anchor=anchor)
+            MetricConfig(start_pose=pose)
 
 
 def test_covariances_are_honest_about_unseen_places_and_large_for_strange_features():

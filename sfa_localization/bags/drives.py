@@ -61,7 +61,7 @@ def as_live(recipe: R, panorama: PanoramaConfig) -> R:
     """The recipe to read a drive with a model's panorama, as the nodes do: the filter also fuses
     images far from any odometry.
     """
-    topics = replace(recipe.topics, measured_places='')
+    topics = replace(recipe.topics, points_topic='')
     return replace(recipe, topics=topics, panorama=panorama, odometry_tolerance_s=0.0)
 
 
@@ -222,8 +222,8 @@ def _other_streams(bag: Bag, recipe: ReadingRecipe, want_truth: bool) -> dict[st
         logger.warning('%s: no message on %s: continuing without gyroscope', bag.path, names)
     if recipe.camera.level_by_imu:
         streams['orientation'] = bag.stream(bag.find('imu', topics.imu), read_tilt)
-    if topics.measured_places:
-        name = bag.find('measured_places', topics.measured_places)
+    if topics.points_topic:
+        name = bag.find('points_topic', topics.points_topic)
         streams['points'] = bag.stream(name, decoding.place_of)
     if want_truth:
         name = bag.find('ground_truth', topics.ground_truth)

@@ -48,7 +48,7 @@ KINDS = {
     'image': Kind('images', '--image-topic', _IMAGES, _IMAGES),
     'odometry': Kind('odometry', '--odom-topic', (decoding.ODOMETRY,), decoding.POSES),
     'imu': Kind('yaw rates', '--imu-topic', (decoding.IMU,), (decoding.IMU,)),
-    'measured_places': Kind('measured places', '--anchor-topic', decoding.PLACES, decoding.PLACES),
+    'points_topic': Kind('measured places', '--points-topic', decoding.PLACES, decoding.PLACES),
     'ground_truth': Kind('true poses', '--ground-truth-topic', _TRUTH, decoding.POSES),
 }
 

@@ -16,7 +16,7 @@ class TopicNames(Settings):
     image: str = setting('', 'images: Image or CompressedImage')
     odometry: str = setting('', 'wheel odometry: Odometry, or any pose when named')
     imu: str = setting('', 'yaw rate: Imu')
-    measured_places: str = setting(
+    points_topic: str = setting(
         '', 'measured places: PoseWithCovarianceStamped, PoseStamped or PointStamped'
     )
     ground_truth: str = setting('', 'true poses, read for evaluation only')

@@ -25,7 +25,7 @@ TOPIC_OPTIONS = {
     'image': '--image-topic',
     'odometry': '--odom-topic',
     'imu': '--imu-topic',
-    'measured_places': '--anchor-topic',
+    'points_topic': '--points-topic',
     'ground_truth': '--ground-truth-topic',
 }
 

@@ -24,7 +24,7 @@ EXAMPLES = """\
   train bags/coverage --output garden.npz
   train bags/a bags/b --output garden.npz --config localization.yaml --report report
   train recording --output garden.npz --image-topic /front/image_raw --odom-topic /odom
-  train recording --output garden.npz --anchors points.csv
+  train recording --output garden.npz --points points.csv
   train --update garden.npz recording --output newer.npz"""
 
 
@@ -44,9 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--resume', action='store_true', help='continue an interrupted training')
     parser.add_argument('--strict', action='store_true', help='reject damaged bags')
     parser.add_argument('--force', action='store_true', help='train on what contradicts itself too')
-    options.add_topics(parser, 'image', 'odometry', 'imu', 'measured_places')
+    options.add_topics(parser, 'image', 'odometry', 'imu', 'points_topic')
     options.add_settings(parser, SegmentConfig, ('segments',))
-    options.add_settings(parser, MetricConfig, ('solver', 'metric_map', 'anchors'))
+    options.add_settings(parser, MetricConfig, ('solver', 'metric_map', 'points'))
     options.add_settings(parser, NetworkConfig, ('engine', 'normalization'))
 
 

@@ -23,11 +23,11 @@ from sfa_localization.data.sphere import Sphere
 from sfa_localization.keyframes.closures import Closures, Views
 from sfa_localization.keyframes.offsets import Offsets, find_offsets
 from sfa_localization.keyframes.turning import lever_square
-from sfa_localization.metric.anchors import Anchors, Settled, settle
 from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import MetricResult, learn_metric
 from sfa_localization.metric.loops import with_closures
+from sfa_localization.metric.measured_points import MeasuredPoints, Settled, settle
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.motion_sources import compare_map
 from sfa_localization.metric.mount import MOUNTED_ANEW_RAD, Mount
@@ -125,8 +125,8 @@ class Drives:
             return segments
         drives = [(drive.run.odometry, drive.stamps_ns) for drive in self.items]
         images = np.concatenate([one.images for one in segments])
-        anchors = Anchors.of(self.points, drives, images, settled, mount.lever)
-        return replace(segments, anchors=anchors)
+        points = MeasuredPoints.of(self.points, drives, images, settled, mount.lever)
+        return replace(segments, points=points)
 
     def _yaws(self) -> Iterator[Array]:
         """Headings rad of the odometry at the images of each drive."""
@@ -188,7 +188,7 @@ def rig_of(drives: Drives, segments: Segments) -> Rig:
     """What was learned of the robot."""
     usual, delays = Rig(), [drive.delay_s for drive in drives.items if drive.delay_s is not None]
     ways = np.array([way or Way(loss_std=usual.turn_loss.std) for way in segments.ways])
-    scale_std = segments.anchors.settled.scale_std if segments.anchors else SCALE_STD
+    scale_std = segments.points.settled.scale_std if segments.points else SCALE_STD
     scale, loss, _ = ways.mean(axis=0).tolist()
     return Rig(
         **segments.mount.quantities,
@@ -233,23 +233,23 @@ def learn_map(
     return segments, result
 
 
-def anchored(
+def with_points(
     drives: Drives, segments: Segments, maps: Maps, again: Callable[[Segments], Maps]
 ) -> tuple[Segments, Maps]:
     """Segments and maps in the coordinates and meters of the measured points, if there are any: the
     last map shows what these say, and all are learned `again`; once more where the map that the
     points bend straight shows other ones to be right.
     """
-    for _ in range(_POINT_ROUNDS if segments.anchors else 0):
-        assert segments.anchors is not None
-        before, result = segments.anchors.settled, maps[-1]
-        now = settle(segments.anchors, result.points, result.points_covariance)
+    for _ in range(_POINT_ROUNDS if segments.points else 0):
+        assert segments.points is not None
+        before, result = segments.points.settled, maps[-1]
+        now = settle(segments.points, result.points, result.points_covariance)
         if (now.used == before.used).all():
             break
         ways = [(way or Way()).scaled(now.scale) for way in segments.ways]
         segments = drives.cut(ways, replace(now, scale=before.scale * now.scale))
         maps = again(segments)
-    if segments.anchors is not None:
-        for text in segments.anchors.warnings(maps[-1].points):
+    if segments.points is not None:
+        for text in segments.points.warnings(maps[-1].points):
             logger.warning(text)
     return segments, maps

@@ -3,7 +3,7 @@
 """The map of a fit in the map frame, and how uncertain its directions, places and weights are.
 
 The paper leaves the frame open (end of section 3.2): found solutions may be translated and rotated.
-It is the odometry frame at the start of the first run, or given by an anchor or measured points.
+Here it is the odometry frame at the start of the first run, or given by `start_pose` or points.
 """
 
 from __future__ import annotations
@@ -87,11 +87,11 @@ def _uncertain_segments(fit: MapFit) -> tuple[Complex, Complex]:
 def places_of_points(fit: MapFit) -> tuple[Complex, Complex]:
     """Where the drive puts the robot at measured points (K,), and the covariance (K, K) per axis of
     that, without a motion of the whole map; 0 for the paper's descent."""
-    anchors, solution, period = fit.problem.segments.anchors, fit.solution, fit.stack.period
+    measured, solution, period = fit.problem.segments.points, fit.solution, fit.stack.period
     graph = fit.problem.graph
-    if anchors is None:
+    if measured is None:
         return np.zeros(0, complex), np.zeros((0, 0), complex)
-    rows = anchors.rows(fit.stack)
+    rows = measured.rows(fit.stack)
     known = np.zeros((len(rows), len(rows)), complex) if graph is None else graph.covariance(rows)
     return rows @ solution.coefficients(period), known
 
@@ -109,16 +109,15 @@ def map_frame(fit: MapFit) -> RigidTransform:
 
     The certified track is aligned with the odometry of the first run, each image weighted by how
     little the odometry can have drifted until then: the map coincides with the odometry frame at
-    the start of the run. With an anchor, the run starts at the anchor's pose in the map. Measured
-    points come first.
+    the start of the run. With a `start_pose`, the run starts there. Measured points come first.
     """
-    start, anchors = _start_frame(fit), fit.problem.segments.anchors
-    return start if anchors is None else anchors.frame(places_of_points(fit)[0], start)
+    start, measured = _start_frame(fit), fit.problem.segments.points
+    return start if measured is None else measured.frame(places_of_points(fit)[0], start)
 
 
 def _start_frame(fit: MapFit) -> RigidTransform:
     """By the odometry at the start of the first run, or the pose that it is to have."""
-    segments, stack, anchor = fit.problem.segments, fit.stack, fit.problem.config.anchor
+    segments, stack, pose = fit.problem.segments, fit.stack, fit.problem.config.start_pose
     starts, variances = _odometry(fit)
     rows = np.flatnonzero(stack.owner < len(starts))
     x, y, yaw = starts[stack.owner[rows]].T
@@ -126,11 +125,11 @@ def _start_frame(fit: MapFit) -> RigidTransform:
     weights = 1.0 / (variances[stack.owner[rows]] + fit.variance)
     turn, shift = align_complex(fit.places[rows], driven, weights)
     frame = RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
-    if not anchor:
+    if not pose:
         return frame
     start = segments.mount.base(segments[0].start[None], 0)[0]
-    to_anchor = compose(np.array(anchor), invert(start))
-    moved = compose(to_anchor, np.array([frame.x_m, frame.y_m, frame.yaw_rad]))
+    to_pose = compose(np.array(pose), invert(start))
+    moved = compose(to_pose, np.array([frame.x_m, frame.y_m, frame.yaw_rad]))
     return RigidTransform(*(float(value) for value in moved))
 
 

@@ -136,7 +136,7 @@ def learn_metric(
     """
     problem = MetricProblem.of(features, segments, config, seed)
     check_amount(problem.stack, problem.links)
-    tied = len(segments.closures) or len(segments.offsets.images) or segments.anchors
+    tied = len(segments.closures) or len(segments.offsets.images) or segments.points
     if tied and config.solver == 'certified':
         problem = replace(problem, graph=(onto and onto.graph) or Graph.of(segments))
     fit = paper_solver.learn(problem) if config.solver == 'paper' else choose(problem, scale)
@@ -153,7 +153,7 @@ def learn_metric(
     diagnostics = diagnose(fit)
     _check_certificate(fit)
     check(diagnostics)
-    by_points = segments.anchors is not None and segments.anchors.settled.used.any()
+    by_points = segments.points is not None and segments.points.settled.used.any()
     frame = map_frame(fit) if onto is None or by_points else _frame_of(onto, fit)
     return _result(fit, left, frame, diagnostics)
 

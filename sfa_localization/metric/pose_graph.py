@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What odometry, loop closures and measured points alone say of all drives, with a certificate.
 
-The least squares of links.py, loops.py and anchors.py in [o, z, -b z] (see stack.py), without
-features: each square reads few segments, so that Gauss and Newton's normal equations are sparse,
-and a drive of thousands of segments takes seconds. With multipliers
+The least squares of links.py, loops.py and measured_points.py in [o, z, -b z] (see stack.py),
+without features: each square reads few segments, so that Gauss and Newton's normal equations are
+sparse, and a drive of thousands of segments takes seconds. With multipliers
 Lambda = diag(Re(conj(z) * (S x)_z)), S the quadratic form at the biases and x = [o, z] where o is
 best, S - diag(0, Lambda) >= 0 proves the directions optimal, as H - Lambda >= 0 does in phases.py:
 H is what S leaves of z. A sparse factor shows it by the signs of its pivots.
@@ -23,9 +23,9 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
 from sfa_localization.data.geometry import Array, Complex
 from sfa_localization.data.statistics import evenly
-from sfa_localization.metric.anchors import Anchors
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.loops import Loops, loops_of
+from sfa_localization.metric.measured_points import MeasuredPoints
 from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.phases import CERTIFICATE_TOLERANCE, Certificate, unit
 from sfa_localization.metric.quadratic_form import YAW_BIAS_STD
@@ -63,8 +63,8 @@ class Graph:
         """Of segments with closures, offsets and points; loops and links as noisy as they show."""
         stack, stated = Stack.of(segments), Links.of(segments)
         loops = loops_of(segments.closures, segments.offsets, stack)
-        given: list[Loops | Anchors] = [*loops]
-        given += [segments.anchors] if segments.anchors else []
+        given: list[Loops | MeasuredPoints] = [*loops]
+        given += [segments.points] if segments.points else []
         stay = stack.sparse((np.arange(stack.segments), np.full(stack.segments, np.sqrt(_STAY))))
         graph, links = None, stated
         for _ in range(_ROUNDS):

@@ -21,7 +21,6 @@ from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_a
 from sfa_localization.data.run import Count, Odometry, Stamps, Trajectory, YawRate
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.keyframes.offsets import Offsets
-from sfa_localization.metric.anchors import Anchors
 from sfa_localization.metric.dead_reckoning import (
     LENGTH,
     MOMENT,
@@ -33,6 +32,7 @@ from sfa_localization.metric.dead_reckoning import (
     summed,
     tally,
 )
+from sfa_localization.metric.measured_points import MeasuredPoints
 from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.settings import SegmentConfig
 
@@ -119,7 +119,7 @@ class Segments:
     closures: Closures = field(default_factory=Closures.none)
     offsets: Offsets = field(default_factory=Offsets.none)
     ways: tuple[Way | None, ...] = (None,)
-    anchors: Anchors | None = None
+    points: MeasuredPoints | None = None
     mount: Mount = field(default_factory=Mount)
 
     def __len__(self) -> int:

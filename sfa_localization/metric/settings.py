@@ -48,7 +48,7 @@ class MetricConfig(Settings):
     slow_features: int = setting(
         0, 'slowest features used; 0: all, of monomials 8 as in the paper', low=0, high=1000
     )
-    anchor: tuple[float, ...] = setting(
+    start_pose: tuple[float, ...] = setting(
         (),
         'pose in the map at the start of the first run: x (m), y (m), yaw (rad); empty: as in the '
         'odometry frame',
@@ -58,13 +58,13 @@ class MetricConfig(Settings):
         'where the camera sits on the robot, ahead (m) and left (m) of base_link; empty: learned '
         'from places that are seen in several headings',
     )
-    anchors: str = setting(
+    points: str = setting(
         '', 'file of measured points of the drives, which give the map its place, heading and scale'
     )
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
-        if len(self.anchor) not in (0, 3):
-            raise ConfigError(f'anchor: {self.anchor} is not empty, and not x, y, yaw')
+        if len(self.start_pose) not in (0, 3):
+            raise ConfigError(f'start_pose: {self.start_pose} is not empty, and not x, y, yaw')
         if len(self.camera_xy) not in (0, 2):
             raise ConfigError(f'camera_xy: {self.camera_xy} is not empty, and not ahead, left')

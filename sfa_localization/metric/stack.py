@@ -7,8 +7,8 @@ With p = x + i y in meters and z_n = exp(i alpha_n), image m of segment n lies a
     o_n + z_n (q_nm - b drift_nm)
 
 with the odometry's path q_nm in the segment, d_nm of the paper on a straight line, and the yaw-rate
-bias b of its period. That is linear in the unknowns [o, z, -b z] (3N,): links of odometry
-(links.py), loop closures (loops.py) and measured points (anchors.py) are rows that read a few.
+bias b of its period. That is linear in the unknowns [o, z, -b z] (3N,). Links of odometry
+(links.py), loop closures (loops.py) and measured points (measured_points.py) are sparse rows.
 """
 
 from __future__ import annotations

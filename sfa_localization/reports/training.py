@@ -99,8 +99,8 @@ def weak_lines(trained: Trained) -> list[str]:
     ]
     even = f'Nowhere is the expected error more than {_WEAK} times the mean.'
     uneven = f'On {share:.0%} of the covered ground it is more than {_WEAK} times the mean.'
-    frame = 'x and y are those of the odometry where the first drive starts, or of its anchor.'
-    if trained.segments.anchors is not None:
+    frame = 'x and y are those of the odometry where the first drive starts, or of start_pose.'
+    if trained.segments.points is not None:
         frame = 'x and y are those of the measured points.'
     return [*lines, uneven if lines else even, frame]
 

@@ -29,9 +29,9 @@ from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.localizer import Localizer
-from sfa_localization.metric.anchors import Anchors, Settled, settle
-from sfa_localization.metric.drives import Drive, Drives, anchored, learn_map
+from sfa_localization.metric.drives import Drive, Drives, learn_map, with_points
 from sfa_localization.metric.learning import learn_metric
+from sfa_localization.metric.measured_points import MeasuredPoints, Settled, settle
 from sfa_localization.metric.points import points_of, read_points, stops
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Stack
@@ -55,7 +55,9 @@ def points(places):
 def settled(measured, places, std=0.02):
     """What points say of a map that puts them at places, each as well as `std` says."""
     count = len(places)
-    beside = Anchors(points(measured), np.arange(count), np.zeros(count, complex), Settled(None))
+    beside = MeasuredPoints(
+        points(measured), np.arange(count), np.zeros(count, complex), Settled(None)
+    )
     return settle(beside, np.asarray(places), std**2 * np.eye(count, dtype=complex))
 
 
@@ -99,7 +101,7 @@ def test_points_that_cannot_be_of_the_drive_are_an_error_that_says_why():
     marks = np.array([0, 7 + 1j, 9 + 6j, 2 + 8j, -3 + 4j])
     with pytest.raises(DataError, match='numbered as inspect'):
         settled(np.roll(marks, 1), counted(marks))
-    nowhere = Anchors(points(CORNERS), np.full(5, -1), np.zeros(5, complex), Settled(None))
+    nowhere = MeasuredPoints(points(CORNERS), np.full(5, -1), np.zeros(5, complex), Settled(None))
     with pytest.raises(DataError, match='are their stamps those of the bags'):
         settle(nowhere, counted(CORNERS), np.eye(5, dtype=complex))
 
@@ -161,7 +163,7 @@ def in_coordinates(drives, features):
         return result, None, result
 
     segments, first = learn_map(drives, features, CONFIG)
-    segments, maps = anchored(drives, segments, (first, None, first), again)
+    segments, maps = with_points(drives, segments, (first, None, first), again)
     return segments, maps[-1]
 
 
@@ -191,7 +193,7 @@ def test_a_map_lies_in_the_coordinates_of_its_points():
         error, by_similarity, scale = errors(chosen, wrong)
         segments, result = learned(chosen, wrong)
         # Heading and scale are as good as points and drive are there.
-        scale_std = segments.anchors.settled.scale_std
+        scale_std = segments.points.settled.scale_std
         assert error < 1.25 * max(by_similarity, rest) + scale_std * HALF_M
         assert abs(scale - 1.0) < 3 * scale_std
         assert result.certificate.certified
@@ -199,11 +201,11 @@ def test_a_map_lies_in_the_coordinates_of_its_points():
 
 def test_the_wrong_point_is_named_and_missed_by_what_it_is_wrong():
     segments, result = learned(far_apart(), 2)
-    quality = segments.anchors.quality(result.points)
+    quality = segments.points.quality(result.points)
     assert [one['used'] for one in quality['points']] == [True, True, False, True, True]
     assert quality['points'][2]['miss_m'] == pytest.approx(2.0, abs=0.1)
     assert max(one['miss_m'] for one in quality['points'] if one['used']) < 0.1
-    (said,) = segments.anchors.warnings(result.points)
+    (said,) = segments.points.warnings(result.points)
     assert said.startswith('point 2: ')
 
 
@@ -212,8 +214,8 @@ def test_one_point_moves_the_map_of_the_odometry():
     turned = align(plain.poses[:, :2], result.poses[:, :2])
     assert turned.yaw_rad == pytest.approx(0.0, abs=1e-3)
     assert np.abs(turned.apply(plain.poses[:, :2]) - result.poses[:, :2]).max() < 1e-2
-    assert segments.anchors.quality(result.points)['points'][0]['miss_m'] < 1e-9
-    assert segments.anchors.settled.scale == 1.0
+    assert segments.points.quality(result.points)['points'][0]['miss_m'] < 1e-9
+    assert segments.points.settled.scale == 1.0
 
 
 def test_points_bend_a_route_straight():
@@ -310,7 +312,7 @@ def test_points_clicked_on_the_map_of_a_lidar_give_a_model_its_coordinates(tmp_p
             bag.image('/panorama', stamp, images[k], 'base_link')
             if k % 20 == 10:
                 bag.message('/clicked_point', stamp, clicked(stamp, complex(*in_lidar_map[k])))
-    topics = replace(SMALL_RECIPE.topics, measured_places='/clicked_point')
+    topics = replace(SMALL_RECIPE.topics, points_topic='/clicked_point')
     trained = train([tmp_path / 'drive'], tmp_path / 'm.npz', replace(SMALL_RECIPE, topics=topics))
     model = PlaceModel.load(tmp_path / 'm.npz')
     found = np.array([model.locate(image).position for image in images[::5]])

@@ -69,7 +69,7 @@ class Settled:
 
 
 @dataclass(frozen=True, slots=True)
-class Anchors:
+class MeasuredPoints:
     """K points beside images: the robot was `offset` (K,) x + i y m, in its own axes, from where
     it took an image when it stood at a measured place.
     """
@@ -87,7 +87,7 @@ class Anchors:
         images: Indices,
         settled: Settled | None = None,
         lever: complex = 0j,
-    ) -> Anchors:
+    ) -> MeasuredPoints:
         """Points beside the nearest of the used `images`, which are numbered drive after drive.
 
         A drive is its odometry and the stamps of its images; a point is of the first that was under
@@ -194,18 +194,18 @@ class Anchors:
             )
 
 
-def settle(anchors: Anchors, places: Complex, covariance: Complex) -> Settled:
+def settle(measured: MeasuredPoints, places: Complex, covariance: Complex) -> Settled:
     """What points say of a map that puts them at places (K,) with a covariance (K, K) per axis.
 
     Raises DataError where they cannot be those of this drive.
     """
-    placed = anchors.placed
+    placed = measured.placed
     if not placed.any():
         raise DataError(
             f'none of {len(placed)} measured points is within {NEAR_M} m of an image that was '
             'used: are their stamps those of the bags?'
         )
-    points, std = anchors.points.places[placed], anchors.points.std[placed]
+    points, std = measured.points.places[placed], measured.points.std[placed]
     points = points - points.mean()  # some coordinates count from the equator
     known = covariance[np.ix_(placed, placed)]
     fit = _Fit(points, places[placed], known + np.diag(std**2))
