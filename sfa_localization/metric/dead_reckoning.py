@@ -188,7 +188,7 @@ def _gyro_turns(
     areas = (gyro.omega[1:] + gyro.omega[:-1]) / 2 * np.diff(seconds)
     turns = np.diff(np.interp(at, seconds, summed(areas)))
     wheels, dt = np.diff(yaw), np.diff(at)
-    measured = _bridged(stamps, gyro.stamps_ns, round(GAP_MAX_S * 1e9))
+    measured = without_pause(stamps[:-1], stamps[1:], gyro.stamps_ns, GAP_MAX_S)
     both = measured & unbroken
     if not both.any():
         tally(skipped, 'without a usable gyroscope', unbroken)
@@ -200,14 +200,14 @@ def _gyro_turns(
     return np.where(measured, turns, wheels + offset * dt), own
 
 
-def _bridged(stamps: Stamps, readings: Stamps, gap_ns: int) -> Mask:
-    """Mask (N - 1,) of the steps between stamps (N,) along which readings (M,) never pause."""
-    before = np.searchsorted(readings, stamps[:-1], 'right') - 1
-    after = np.searchsorted(readings, stamps[1:], 'left')
-    inside = (before >= 0) & (after < len(readings))
-    pauses = np.concatenate([[0], np.cumsum(np.diff(readings) > gap_ns)])
-    before, after = np.clip([before, after], 0, len(readings) - 1)
-    return np.asarray(inside & (pauses[before] == pauses[after]))
+def without_pause(begin: Stamps, end: Stamps, stamps: Stamps, pause_s: float) -> Mask:
+    """Mask (M,) of the times from `begin` (M,) to `end` (M,) in which stamps (N,) never pause."""
+    before = np.searchsorted(stamps, begin, 'right') - 1
+    after = np.searchsorted(stamps, end, 'left')
+    inside = (before >= 0) & (after < len(stamps))
+    before, after = np.clip([before, after], 0, len(stamps) - 1)
+    number = summed(np.diff(stamps) > pause_s * 1e9)
+    return np.asarray(inside & (number[before] == number[after]))
 
 
 def _with_yaw(poses: Array, yaw: Array, measured: Array) -> Array:
