@@ -60,8 +60,8 @@ class Source:
 
     @property
     def period_s(self) -> float:
-        """Median time between messages."""
-        return float(np.median(np.diff(self.stamps_ns))) * 1e-9
+        """Mean time between messages, which may come in bundles."""
+        return float(self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9 / (len(self.stamps_ns) - 1)
 
     def moved(self, windows: Stamps, what: str) -> Array:
         """The motion (...) in windows (..., 2) ns."""
@@ -190,8 +190,7 @@ def compare(a: Source, b: Source, what: str = 'turns') -> Pair | None:
 
 def _windows(slow: Source, fast: Source, length_s: float) -> Stamps:
     """Windows (M, 2) ns between stamps of the slow source; whatever the delay, neither pauses."""
-    grid = np.arange(slow.stamps_ns[0], slow.stamps_ns[-1], round(length_s * 1e9))
-    edges = slow.stamps_ns[np.unique(np.searchsorted(slow.stamps_ns, grid))]
+    edges = slow.stamps_ns[:: int(np.ceil(length_s / slow.period_s))]
     windows = np.column_stack([edges[:-1], edges[1:]])
     reach = round(CLOCK_RANGE_S * 1e9)
     for source, margin in ((slow, 0), (fast, reach)):
