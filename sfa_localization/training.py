@@ -133,7 +133,7 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     quality: dict[str, Any] = {'features_used': first.map.features, 'turned': turned is not None}
     quality |= {'delta': network.deltas[-1].tolist(), 'rank': [*map(list, network.ranks)]}
     quality |= segments.anchors.quality(result.points) if segments.anchors else {}
-    quality |= {**images.quality, **segments.quality, **result.quality, **known.quality}
+    quality |= {'segments': len(segments), **images.quality, **result.quality, **known.quality}
     model = PlaceModel(
         network,
         result.map,

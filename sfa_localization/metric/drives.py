@@ -115,7 +115,7 @@ class Drives:
         """
         ways, mount = ways or [None] * len(self.items), self.mount.of(len(self.items))
         parts = [
-            cut_track(track.mounted(mount.lever), drive.stamps_ns, self.config)
+            cut_track(replace(track, lever=mount.lever), drive.stamps_ns, self.config)
             for track, drive in zip(self._driven(ways), self.items, strict=True)
         ]
         offsets = self.offsets.of_robot(self._camera_yaw)
