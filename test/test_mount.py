@@ -50,7 +50,7 @@ def world(twists, start, cameras, mount=None, aside=0.0, noise_m=0.02):
         run = drive(twists, start=beside, yaw_noise=0.02, seed=number)
         starts.append(sum(map(len, poses)))
         poses.append(camera(run.poses))
-        track = OdometryTrack.of(run.odometry, CONFIG).mounted(mount.lever)
+        track = dataclasses.replace(OdometryTrack.of(run.odometry, CONFIG), lever=mount.lever)
         parts.append(cut_track(track, run.stamps_ns, CONFIG))
     poses = np.concatenate(poses)
     segments = dataclasses.replace(join(parts, starts), mount=mount)

@@ -13,6 +13,8 @@ from sfa_localization.data.run import Stamps
 ODOMETRY, IMAGE = range(2)
 DELAY_LIMIT_NS = 500_000_000
 """Largest delay of the camera's stamps, either way, that is compensated."""
+CLOCK_RANGE_S = 2.5
+"""Largest difference of two clocks that turns show."""
 
 
 def merge_by_stamp(odometry_ns: Stamps, images_ns: Stamps) -> Iterator[tuple[int, int, int]]:

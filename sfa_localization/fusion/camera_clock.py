@@ -14,12 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfa_localization.data.events import ODOMETRY, merge_by_stamp
+from sfa_localization.data.events import CLOCK_RANGE_S, ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, Stamps
 
-LONGEST_S = 2.5
-"""Clocks farther apart are not recognized."""
 NEAR_NS = 150_000_000
 """Headings of images nearer in time are left out: they show turns that are too small."""
 
@@ -56,13 +54,13 @@ class CameraClock:
 
 SIGNIFICANT_STDS, _MEAN_OF_NORMAL = 2.5, 0.798  # of |x|: sqrt(2 / pi)
 _STEP_S = 0.02
-_GRID = np.arange(-round(LONGEST_S / _STEP_S), round(LONGEST_S / _STEP_S) + 1) * _STEP_S
+_GRID = np.arange(-round(CLOCK_RANGE_S / _STEP_S), round(CLOCK_RANGE_S / _STEP_S) + 1) * _STEP_S
 # Images farther apart in time, or with a pause of the odometry between, are not compared. An
 # estimate is for images stamped so much later, so that those in transit do not depend on which
 # message came first.
 _APART_NS, _PAUSE_NS = 1_000_000_000, 500_000_000
 _IN_TRANSIT_NS, _REMEMBERED_NS = 1_000_000_000, 10_000_000_000
-_WINDOW_NS = round(LONGEST_S * 1e9) + 100_000_000
+_WINDOW_NS = round(CLOCK_RANGE_S * 1e9) + 100_000_000
 # Differences beyond a few of these, rad, are mismatches of images and count no more; sums that
 # differ by one of them show no difference between delays.
 _SCALE_RAD, _OUTLIER, _ALIKE = 0.05, 4.0, 1.0

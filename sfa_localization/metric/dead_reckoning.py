@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -11,35 +12,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, Complex, Indices, Mask, wrap_angle
+from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, Complex, Indices, Mask
 from sfa_localization.data.run import Count, Odometry, Stamps, YawRate, differences
 from sfa_localization.metric.settings import SegmentConfig
 
 GAP_MAX_S = 0.5
 """Longer pauses of odometry or gyroscope are breaks: the robot may have been moved meanwhile."""
-# Periods of the odometry that are no pause, however slow it is.
+# Pauses are longer than so many periods of the odometry.
 _PERIODS = 2.5
-# A pause up to this long is bridged where the twists before and after differ by no more.
-_BRIDGE_MAX_S = 1.5
-_UNSURE_M, _UNSURE_RAD = 0.05, 0.1
-# Yaw rates are averaged over this long before they are compared with a threshold.
-_SMOOTHING_S = 0.3
+# A shorter pause is bridged where the twists before and after differ by less.
+_BRIDGE_MAX_S, _UNSURE_M, _UNSURE_RAD = 1.5, 0.05, 0.1
 
 TURN_SLIDE = 0.05
-"""m per rad: how far the wheels slide sideways in a turn on the spot, and turns seem misplaced."""
+"""m per rad: how far wheels slide sideways in a turn on the spot."""
 SEEN_TURN_SLIDE = 0.01
-"""m per rad: what remains of it where images show the turns; 0.007 of two real indoor robots. With
-more, links are so weak that their maps shrink by 4 %."""
-
-# Columns of the accumulated sums: driven meters, radians turned in either direction, yaw variance,
-# and the two parts of the moment of time, the integral of t dp, on which a yaw-rate bias acts.
-LENGTH, TURNED, YAW_VARIANCE, MOMENT = 0, 1, 2, slice(3, 5)
+"""m per rad: what remains of it where images correct the turns; 0.007 for two real indoor robots.
+With more, the links are so weak that maps shrink by 4 %."""
 
 
 @dataclass(frozen=True, slots=True)
 class TurnCorrection:
     """What to add to the yaw of a track: `yaw` (N,) rad at stamps (N,), linear between them, and
-    the `noise` of the turns that result, rad per square root of s.
+    the `noise` of the resulting turns, rad per square root of s.
     """
 
     stamps_ns: Stamps
@@ -48,8 +42,8 @@ class TurnCorrection:
 
 
 class Way(NamedTuple):
-    """The way of a drive by that which its wheels counted: `scale` times it, less a `loss`, m per
-    radian, in turns, which is known to `loss_std`.
+    """The way of a drive, from the way that its wheels counted: `scale` times it, less a `loss`
+    (m per radian) in turns, of standard deviation `loss_std`.
     """
 
     scale: float = 1.0
@@ -57,89 +51,110 @@ class Way(NamedTuple):
     loss_std: float = 0.0
 
     def scaled(self, factor: float) -> Way:
-        """The same in meters that are longer by a factor."""
-        return Way(*(factor * each for each in self))
+        """The same way after a change of the meter."""
+        return Way(factor * self.scale, factor * self.loss, factor * self.loss_std)
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryTrack:
-    """Poses at the N odometry stamps, with running sums of what accumulates along the track."""
+    """Poses (N, 3) of base_link at the N odometry stamps, with unwrapped yaw, and what accumulates
+    along them.
+    """
 
     stamps_ns: Stamps
     poses: Array
-    yaw: Array
-    speed: Array
-    turn_rate: Array
     part: Indices
-    """(N,) number of the unbroken part that each pose is in."""
-    sums: Array
-    """(N, 5), see the columns above."""
+    """(N,) number of the unbroken part of each pose."""
+    yaw_variance: Array
+    """(N,) rad^2 since the start, without a bias of the yaw rate."""
     count: Count
     slide: float = TURN_SLIDE
-    """m per rad turned: by how much the places are wrong."""
+    """m per rad turned: error of the places."""
+    lever: complex = 0.0
+    """Where the camera sits on the robot, ahead + i left, m."""
 
     @classmethod
     def of(
         cls, odometry: Odometry, config: SegmentConfig, yaw_rate: YawRate | None = None
     ) -> OdometryTrack:
-        """From wheel odometry, with the turns of the gyroscope where there is one."""
-        stamps, poses, skipped = odometry.stamps_ns, odometry.poses, dict[str, int]()
+        """From wheel odometry, with the turns of the gyroscope if there is one."""
+        stamps, skipped = odometry.stamps_ns, Counter[str]()
         if len(stamps) < 2:
             raise DataError('fewer than two usable odometry messages: check the odometry topic')
-        twists = _twists(odometry)
         breaks = pauses(odometry)
-        tally(skipped, 'pauses', breaks)
+        skipped['pauses'] += int(breaks.sum())
         breaks |= np.diff(odometry.part) != 0
-        variances, yaw = odometry.variances[:, 1], np.unwrap(poses[:, 2])
-        gyro = None if config.yaw_source == 'odometry' else yaw_rate
-        if gyro is not None and len(gyro.stamps_ns) > 1:
-            turns, variances = _gyro_turns(stamps, yaw, variances, ~breaks, gyro, skipped)
-            measured = yaw[0] + summed(turns)
-            poses, yaw = _with_yaw(poses, yaw, measured), measured
-            twists = np.column_stack([twists[:, 0], np.gradient(yaw, seconds_since_start(stamps))])
+        yaw, variances = np.unwrap(odometry.poses[:, 2]), odometry.variances[:, 1]
+        poses = np.column_stack([odometry.poses[:, :2], yaw])
+        if config.yaw_source != 'odometry' and yaw_rate and len(yaw_rate.stamps_ns) > 1:
+            turns, variances = _gyro_turns(stamps, yaw, variances, ~breaks, yaw_rate, skipped)
+            yaw = yaw[0] + summed(turns)
         elif config.yaw_source == 'gyro':
             raise DataError('yaw_source is gyro, but there is no yaw rate: name the imu topic')
-        sums = _running_sums(stamps, poses, yaw, variances, config.yaw_noise)
-        rate = _smoothed(seconds_since_start(stamps), twists[:, 1])
-        part = np.concatenate([[0], np.cumsum(breaks)])
-        count = Count(len(stamps), skipped)
-        return cls(stamps, poses, yaw, np.abs(twists[:, 0]), rate, part, sums, count)
+        dt = np.diff(stamps) * 1e-9
+        stated = variances[:-1] * dt**2
+        noise = np.where(stated > 0, stated, config.yaw_noise**2 * dt)
+        part = summed(breaks).astype(np.int64)
+        count = Count(len(stamps), dict(+skipped))
+        return cls(stamps, poses, part, summed(noise), count)._turned(yaw)
+
+    @property
+    def seconds(self) -> Array:
+        """(N,) since the start."""
+        return np.asarray((self.stamps_ns - self.stamps_ns[0]) * 1e-9)
+
+    @property
+    def yaw(self) -> Array:
+        """(N,) rad."""
+        return self.poses[:, 2]
+
+    @property
+    def place(self) -> Complex:
+        """Where the camera is, x + i y (N,) m."""
+        place = self.poses[:, 0] + 1j * self.poses[:, 1] + self.lever * np.exp(1j * self.yaw)
+        return np.asarray(place)
+
+    @property
+    def length(self) -> Array:
+        """Driven since the start (N,), m."""
+        return summed(np.abs(self.steps()))
+
+    @property
+    def turned(self) -> Array:
+        """Turned in either direction since the start (N,), rad."""
+        return summed(np.abs(np.diff(self.yaw)))
 
     def corrected(self, turns: TurnCorrection) -> OdometryTrack:
         """The same wheel steps with corrected turns."""
-        seconds = seconds_since_start(self.stamps_ns)
         at = (turns.stamps_ns - self.stamps_ns[0]) * 1e-9
-        yaw = self.yaw + np.interp(seconds, at, turns.yaw)
-        poses = _with_yaw(self.poses, self.yaw, yaw)
-        sums = _running_sums(self.stamps_ns, poses, yaw, np.zeros(len(yaw)), turns.noise)
-        rate = _smoothed(seconds, np.gradient(yaw, seconds))
-        return replace(self, poses=poses, yaw=yaw, turn_rate=rate, sums=sums, slide=SEEN_TURN_SLIDE)
+        track = self._turned(self.yaw + np.interp(self.seconds, at, turns.yaw))
+        variance = turns.noise**2 * self.seconds
+        return replace(track, yaw_variance=variance, slide=SEEN_TURN_SLIDE)
 
     def driven(self, way: Way) -> OdometryTrack:
-        """The same turns with the way that was driven, not that which wheels counted."""
-        step = way.scale * self.steps() - way.loss * self.way_per_loss()
-        poses = _along(self.poses[0], step, self.poses[:, 2])
-        sums, of_way = self.sums.copy(), _sums_of_way(self.stamps_ns, step)
-        sums[1:, LENGTH], sums[1:, MOMENT] = of_way[:, 0], of_way[:, 1:]
-        return replace(self, poses=poses, sums=sums)
-
-    def mounted(self, lever: complex) -> OdometryTrack:
-        """The way of a camera that sits at a `lever`, ahead + i left, m, of base_link."""
-        place = self.poses[:, 0] + 1j * self.poses[:, 1] + lever * np.exp(1j * self.poses[:, 2])
-        poses, sums = np.column_stack([place.real, place.imag, self.poses[:, 2]]), self.sums.copy()
-        sums[1:, MOMENT] = _sums_of_way(self.stamps_ns, np.diff(place))[:, 1:]
-        return replace(self, poses=poses, sums=sums)
+        """The same turns with the corrected way."""
+        return self._moved(way.scale * self.steps() - way.loss * self.way_per_loss(), self.yaw)
 
     def steps(self) -> Complex:
-        """Displacements (N - 1,) m between the stamps."""
-        return _steps(self.poses)
+        """Displacements (N - 1,) m of base_link between the stamps."""
+        return np.asarray(np.diff(self.poses[:, 0] + 1j * self.poses[:, 1]))
 
     def way_per_loss(self) -> Complex:
-        """Displacements (N - 1,) m that a loss of 1 m per radian takes from them."""
+        """Displacements (N - 1,) m that a loss of 1 m per radian takes from the steps."""
         step, turned = self.steps(), np.abs(np.diff(self.yaw))
         length = np.abs(step)
         moves = length > SPOT_RADIUS_M * turned
         return np.asarray(np.divide(step * turned, length, out=np.zeros_like(step), where=moves))
+
+    def _turned(self, yaw: Array) -> OdometryTrack:
+        """The same wheel steps driven with another yaw (N,)."""
+        change = yaw - self.yaw
+        return self._moved(self.steps() * np.exp(0.5j * (change[:-1] + change[1:])), yaw)
+
+    def _moved(self, step: Complex, yaw: Array) -> OdometryTrack:
+        """Displacements (N - 1,) m and yaw (N,) from the same start."""
+        place = self.poses[0, 0] + 1j * self.poses[0, 1] + summed(step)
+        return replace(self, poses=np.column_stack([place.real, place.imag, yaw]))
 
 
 def summed(steps: NDArray[Any]) -> NDArray[Any]:
@@ -147,27 +162,26 @@ def summed(steps: NDArray[Any]) -> NDArray[Any]:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def seconds_since_start(stamps_ns: Stamps) -> Array:
-    return np.asarray((stamps_ns - stamps_ns[0]) * 1e-9)
+def spaced(sums: Array, least: float) -> Indices:
+    """Rows of increasing sums (N,): the first one, and each that is `least` beyond the last."""
+    rows = [0]
+    for row, value in enumerate(sums):
+        if value - sums[rows[-1]] >= least:
+            rows.append(row)
+    return np.array(rows, np.int64)
 
 
 def pauses(odometry: Odometry) -> Mask:
-    """Mask (N - 1,) of the pauses that odometry does not bridge: it says the same before and after
-    short ones. Drivers that repeat a command, or speak only when it changes, pause like that.
+    """Mask (N - 1,) of the pauses of odometry; short ones with equal twists before and after do not
+    count: drivers that repeat a command, or speak only when it changes, pause like that.
     """
+    twists, poses = odometry.twists, odometry.poses
+    twists = twists if twists.any() else differences(odometry.stamps_ns, poses)
     dt = np.diff(odometry.stamps_ns) * 1e-9
-    # Odometry that is always slow does not pause at each message.
     gap = dt > max(GAP_MAX_S, _PERIODS * float(np.median(dt)))
-    unsure = np.abs(np.diff(_twists(odometry), axis=0)) * dt[:, None]
+    unsure = np.abs(np.diff(twists, axis=0)) * dt[:, None]
     alike = (unsure[:, 0] < _UNSURE_M) & (unsure[:, 1] < _UNSURE_RAD)
     return np.asarray(gap & ~(alike & (dt < _BRIDGE_MAX_S)))
-
-
-def _twists(odometry: Odometry) -> Array:
-    """Twists (N, 2); of drivers that publish poses only, those of the poses."""
-    if np.any(odometry.twists):
-        return odometry.twists
-    return differences(odometry.stamps_ns, odometry.poses)
 
 
 def _gyro_turns(
@@ -176,88 +190,34 @@ def _gyro_turns(
     variances: Array,
     unbroken: Mask,
     gyro: YawRate,
-    skipped: dict[str, int],
+    skipped: Counter[str],
 ) -> tuple[Array, Array]:
     """Turns (N - 1,) between the odometry's stamps, and the variances (N,) of their rate.
 
-    The gyroscope's where it has readings all along a step, else the odometry's: less exact, but
-    a gyroscope that pauses or ends did not measure the turns since. To the odometry's turns the
-    gyroscope's mean offset is added, so that one bias remains for the whole drive.
+    They are the gyroscope's where it has readings all along a step. Elsewhere they are the
+    odometry's plus the gyroscope's mean offset, so that one bias remains for the whole drive.
     """
-    seconds, at = (gyro.stamps_ns - stamps[0]) * 1e-9, seconds_since_start(stamps)
+    seconds, at = (gyro.stamps_ns - stamps[0]) * 1e-9, (stamps - stamps[0]) * 1e-9
     areas = (gyro.omega[1:] + gyro.omega[:-1]) / 2 * np.diff(seconds)
     turns = np.diff(np.interp(at, seconds, summed(areas)))
     wheels, dt = np.diff(yaw), np.diff(at)
-    measured = _bridged(stamps, gyro.stamps_ns, round(GAP_MAX_S * 1e9))
+    measured = without_pause(stamps[:-1], stamps[1:], gyro.stamps_ns, GAP_MAX_S)
     both = measured & unbroken
     if not both.any():
-        tally(skipped, 'without a usable gyroscope', unbroken)
+        skipped['without a usable gyroscope'] += int(unbroken.sum())
         return wheels, variances
-    tally(skipped, 'in a gap of the gyroscope', unbroken & ~measured)
+    skipped['in a gap of the gyroscope'] += int((unbroken & ~measured).sum())
     offset = float((turns - wheels)[both].sum() / dt[both].sum())
-    own = np.interp(at, seconds, gyro.variance)
-    own = np.where(np.append(measured, measured[-1]), own, variances)
-    return np.where(measured, turns, wheels + offset * dt), own
+    by_gyro = np.append(measured, measured[-1])
+    variances = np.where(by_gyro, np.interp(at, seconds, gyro.variance), variances)
+    return np.where(measured, turns, wheels + offset * dt), variances
 
 
-def _bridged(stamps: Stamps, readings: Stamps, gap_ns: int) -> Mask:
-    """Mask (N - 1,) of the steps between stamps (N,) along which readings (M,) never pause."""
-    before = np.searchsorted(readings, stamps[:-1], 'right') - 1
-    after = np.searchsorted(readings, stamps[1:], 'left')
-    inside = (before >= 0) & (after < len(readings))
-    pauses = np.concatenate([[0], np.cumsum(np.diff(readings) > gap_ns)])
-    before, after = np.clip([before, after], 0, len(readings) - 1)
-    return np.asarray(inside & (pauses[before] == pauses[after]))
-
-
-def _with_yaw(poses: Array, yaw: Array, measured: Array) -> Array:
-    """The same wheel steps driven with another yaw (N,)."""
-    middle = (yaw[:-1] + yaw[1:]) / 2
-    step = _steps(poses) * np.exp(1j * ((measured[:-1] + measured[1:]) / 2 - middle))
-    return _along(poses[0], step, wrap_angle(measured))
-
-
-def _steps(poses: Array) -> Complex:
-    """Displacements (N - 1,) m between poses (N, 3)."""
-    return np.diff(poses[:, 0] + 1j * poses[:, 1])
-
-
-def _along(start: Array, step: Complex, yaw: Array) -> Array:
-    """Poses (N, 3) from the place of a `start` (3,) by displacements (N - 1,) m, with yaw (N,)."""
-    place = start[0] + 1j * start[1] + summed(step)
-    return np.column_stack([place.real, place.imag, yaw])
-
-
-def _sums_of_way(stamps: Stamps, step: Complex) -> Array:
-    """Running sums (N - 1, 3) of displacements (N - 1,) m: LENGTH and the two parts of MOMENT."""
-    t = seconds_since_start(stamps)
-    moment = step * (t[1:] + t[:-1]) / 2
-    return np.cumsum(np.column_stack([np.abs(step), moment.real, moment.imag]), axis=0)
-
-
-def _running_sums(
-    stamps: Stamps, poses: Array, yaw: Array, variances: Array, yaw_noise: float
-) -> Array:
-    """Running sums (N, 5); `yaw_noise` (rad per square root of s) where variances (N,) are 0."""
-    dt = np.diff(seconds_since_start(stamps))
-    stated = variances[:-1] * dt**2
-    noise = np.where(stated > 0, stated, yaw_noise**2 * dt)
-    sums, of_way = np.zeros((len(stamps), 5)), _sums_of_way(stamps, _steps(poses))
-    sums[1:, LENGTH], sums[1:, MOMENT] = of_way[:, 0], of_way[:, 1:]
-    sums[1:, TURNED], sums[1:, YAW_VARIANCE] = np.cumsum(np.abs(np.diff(yaw))), np.cumsum(noise)
-    return sums
-
-
-def _smoothed(seconds: Array, rates: Array) -> Array:
-    """Moving average over a fixed time, by the running integral."""
-    total = summed((rates[1:] + rates[:-1]) / 2 * np.diff(seconds))
-    low = np.clip(seconds - _SMOOTHING_S / 2, seconds[0], seconds[-1])
-    high = np.clip(seconds + _SMOOTHING_S / 2, seconds[0], seconds[-1])
-    area = np.interp(high, seconds, total) - np.interp(low, seconds, total)
-    return np.asarray(area / np.maximum(high - low, 1e-9))
-
-
-def tally(skipped: dict[str, int], reason: str, mask: Mask) -> None:
-    """Count the entries that were not used for a reason."""
-    if mask.any():
-        skipped[reason] = skipped.get(reason, 0) + int(mask.sum())
+def without_pause(begin: Stamps, end: Stamps, stamps: Stamps, pause_s: float) -> Mask:
+    """Mask (M,) of the times from `begin` (M,) to `end` (M,) in which stamps (N,) never pause."""
+    before = np.searchsorted(stamps, begin, 'right') - 1
+    after = np.searchsorted(stamps, end, 'left')
+    inside = (before >= 0) & (after < len(stamps))
+    before, after = np.clip([before, after], 0, len(stamps) - 1)
+    number = summed(np.diff(stamps) > pause_s * 1e9)
+    return np.asarray(inside & (number[before] == number[after]))

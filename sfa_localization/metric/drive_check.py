@@ -19,16 +19,14 @@ from sfa_localization.metric.stack import Stack
 ANGLE_STD_MAX_DEG = 10.0
 """Standard deviation of a segment's direction beyond which the map bends visibly."""
 SURE_SHARE = 0.9
-"""Of the driven length, whose directions must be surer: a short piece between two breaks of the
-odometry bends nothing, because the map alone places it."""
+"""Of the driven length whose directions must be surer: a short piece between two breaks of the
+odometry bends nothing, because only the map places it."""
 ROUTE = (
     'no track crosses another: the model holds the route in the shape of its odometry, and little '
     'beside it; cross earlier tracks to learn an area'
 )
-# Fewer directions leave any shear possible.
-_SEGMENTS_MIN = 3
-# Narrower drives do not cover an area.
-_WIDTH_MIN_M = 0.5
+# Fewer directions leave any shear possible; narrower drives do not cover an area.
+_SEGMENTS_MIN, _WIDTH_MIN_M = 3, 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,22 +39,21 @@ class Diagnostics:
     extent_m: tuple[float, float]
     """Four standard deviations of the positions along and across their main axis."""
     directions: float
-    """Spread of driving directions: 0 all parallel, 1 evenly spread (opposite counts as same)."""
+    """Spread of driving directions: 0 all parallel, 1 even; opposite ones count as parallel."""
     crossings: int
-    """Pairs of segments that cross, of different stretches of the drive."""
+    """Pairs of segments that cross, without neighbors."""
     angle_std_rad: float
-    """Uncertainty of a segment's direction relative to the whole map, of all but the least sure
-    segments: see SURE_SHARE."""
+    """Standard deviation of a segment's direction in the map: see SURE_SHARE."""
 
     @property
     def one_route(self) -> bool:
-        """Whether nothing but odometry, by its turns, connects the parts of the drive."""
-        return _connects_nothing(self.extent_m, self.crossings)
+        """Whether no place is passed on different tracks, so that only odometry connects them."""
+        return min(self.extent_m) < _WIDTH_MIN_M or self.crossings == 0
 
 
 def check_amount(stack: Stack, links: Links) -> None:
-    """Raises DataError when there are too few segments to try, or neither turns nor curves: the
-    mirror image of straight lines, or any shear of them, explains their images as well.
+    """Raises DataError for too few segments, or if there are neither turns nor curves: the mirror
+    image of straight lines, or any shear of them, explains their images as well.
     """
     if stack.segments < _SEGMENTS_MIN:
         raise DataError(
@@ -87,10 +84,7 @@ def diagnose(fit: MapFit) -> Diagnostics:
 
 
 def check(diagnostics: Diagnostics) -> None:
-    """Raises DataError, naming what to drive, when the data cannot determine the map.
-
-    One route determines its own map: see `Diagnostics.one_route`.
-    """
+    """Raises DataError, naming what to drive, if the data do not determine the map of an area."""
     if diagnostics.one_route:
         return
     uncertain = min(float(np.rad2deg(diagnostics.angle_std_rad)), 180.0)
@@ -103,19 +97,13 @@ def check(diagnostics: Diagnostics) -> None:
 
 
 def is_one_route(places: Complex, length_m: float) -> bool:
-    """Whether a drive through places (M,), x + i y in meters by the odometry, is one route.
-
-    The same check as that of a map, `Diagnostics.one_route`, of pieces of a length.
+    """`Diagnostics.one_route` of a drive through places (M,), x + i y in meters by the odometry, in
+    pieces of a length.
     """
     steps = np.abs(np.diff(places, prepend=places[:1]))
     piece = np.floor(np.cumsum(steps) / length_m).astype(int)
     first = np.flatnonzero(np.diff(piece, prepend=-1))
-    return _connects_nothing(_extent(places), _crossings(places, first))
-
-
-def _connects_nothing(extent_m: tuple[float, float], crossings: int) -> bool:
-    """Whether images on different tracks of a drive show no place in common."""
-    return min(extent_m) < _WIDTH_MIN_M or crossings == 0
+    return min(_extent(places)) < _WIDTH_MIN_M or _crossings(places, first) == 0
 
 
 def _extent(places: Complex) -> tuple[float, float]:
@@ -131,7 +119,9 @@ def _directions(steps: Complex) -> float:
 
 
 def _crossings(places: Complex, first: Indices) -> int:
-    """Chords of segments, from the rows `first` (N,) on, that cross, leaving out neighbors."""
+    """How many chords of segments, which start at the rows `first` (N,), cross without being
+    neighbors.
+    """
     ends = np.append(first[1:], len(places)) - 1
     a, b = places[first], places[ends]
     i, j = np.triu_indices(len(a), 2)
@@ -139,5 +129,5 @@ def _crossings(places: Complex, first: Indices) -> int:
     def side(p: Complex, q: Complex, r: Complex) -> Array:
         return np.asarray(np.sign(np.imag(np.conj(q - p) * (r - p))))
 
-    apart = side(a[i], b[i], a[j]) * side(a[i], b[i], b[j]) < 0
-    return int((apart & (side(a[j], b[j], a[i]) * side(a[j], b[j], b[i]) < 0)).sum())
+    cross = side(a[i], b[i], a[j]) * side(a[i], b[i], b[j]) < 0
+    return int((cross & (side(a[j], b[j], a[i]) * side(a[j], b[j], b[i]) < 0)).sum())

@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The drives that a map is learned from: odometry, what images show of its errors, and segments.
 
-Wheels err in turns: images show how far the robot turned and, once there is a map, how much of the
-way was lost in turns (odometry_errors.py).
+Images correct the turns of the wheels and, once there is a map, the way (odometry_errors.py).
 """
 
 from __future__ import annotations
@@ -42,22 +41,22 @@ Maps = tuple[MetricResult, TurnedMaps | None, MetricResult]
 logger = logging.getLogger(__name__)
 
 _POINT_ROUNDS = 3
-"""Points that bend the map straight may show other ones to be right, which bend it again."""
+"""Points straighten the map, which may show other points to be right."""
 SCALE_STD = 0.01
-"""Of a map: its meters are those of wheels, seldom known better."""
+"""Of a map whose meters are those of the wheels."""
 _MOUNT_ROUNDS, _MOUNT_SETTLED_M = 4, 0.02
-"""Offsets are measured anew until the camera's place moves by less than they err."""
+"""Offsets are measured again until the camera's place moves by less than their error."""
 _LOSS_ROUNDS = 2
 """The first map hides a third of the way that wheels lose in turns, the next one a tenth."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """A run, the headings (N,) rad `seen` in its N images, whose sign may be either, and by how
-    much their stamps are late, None where the drive does not show it."""
+    """A run, the `headings` (N,) rad of its N images by the shifts between them, whose sign may be
+    either, and by how much their stamps are late; None where the drive does not show it."""
 
     run: Run
-    seen: Sequence[float]
+    headings: Sequence[float]
     delay_ns: int | None = None
 
     @property
@@ -65,16 +64,11 @@ class Drive:
         """(N,) of the images, by the clock of the odometry."""
         return self.run.panoramas.stamps_ns - (self.delay_ns or 0)
 
-    @property
-    def delay_s(self) -> float | None:
-        """By how much the stamps are late."""
-        return None if self.delay_ns is None else self.delay_ns * 1e-9
-
 
 @dataclass(frozen=True, slots=True)
 class Drives:
     """All drives, whose images are numbered drive after drive, their loop closures, with and
-    without offsets, and points that were measured."""
+    without offsets, and measured points."""
 
     items: tuple[Drive, ...]
     closures: Closures
@@ -90,34 +84,29 @@ class Drives:
         return [sum(counts[:k]) for k in range(len(counts))]
 
     def tracks(self) -> list[OdometryTrack]:
-        """Dead reckoning of each drive, with the turns that images show where these are better."""
-        tracks = [
-            OdometryTrack.of(drive.run.odometry, self.config, drive.run.yaw_rate)
-            for drive in self.items
-        ]
-        both = list(zip(tracks, self.items, strict=True))
-        seen = [Headings.of(track, drive.stamps_ns, drive.seen) for track, drive in both]
-        turns = corrections(seen, self.closures)
+        """Dead reckoning of each drive, with the turns of its images where these are better."""
+        runs = [drive.run for drive in self.items]
+        tracks = [OdometryTrack.of(run.odometry, self.config, run.yaw_rate) for run in runs]
+        turns = corrections(self._headings(tracks), self.closures)
         if turns is None:
             return tracks
-        return [track.corrected(own) for track, own in zip(tracks, turns, strict=True)]
+        return [track.corrected(turn) for track, turn in zip(tracks, turns, strict=True)]
 
-    def _driven(self, ways: Sequence[Way | None]) -> Iterator[OdometryTrack]:
-        """Dead reckoning of each drive with the way that was driven."""
-        for track, way in zip(self.tracks(), ways, strict=True):
-            yield track.driven(way) if way else track
+    def _headings(self, tracks: Sequence[OdometryTrack]) -> list[Headings]:
+        pairs = zip(tracks, self.items, strict=True)
+        return [Headings.of(track, each.stamps_ns, each.headings) for track, each in pairs]
 
     def cut(self, ways: Sequence[Way | None] = (), settled: Settled | None = None) -> Segments:
-        """The segments of section 3.1, of all drives; `ways` correct what wheels counted, and the
-        points are those that `settled` found right.
+        """The segments of all drives (section 3.1), with the corrected `ways` of these, and with
+        the points that are right by `settled`.
 
         Raises DataError.
         """
         ways, mount = ways or [None] * len(self.items), self.mount.of(len(self.items))
-        parts = [
-            cut_track(track.mounted(mount.lever), drive.stamps_ns, self.config)
-            for track, drive in zip(self._driven(ways), self.items, strict=True)
-        ]
+        parts = []
+        for track, way, drive in zip(self.tracks(), ways, self.items, strict=True):
+            track = replace(track.driven(way) if way else track, lever=mount.lever)
+            parts.append(cut_track(track, drive.stamps_ns, self.config))
         offsets = self.offsets.of_robot(self._camera_yaw)
         joined = replace(join(parts, self.starts), ways=tuple(ways), mount=mount, offsets=offsets)
         segments = with_closures(joined, self.closures.of_robot(self._camera_yaw))
@@ -128,21 +117,17 @@ class Drives:
         points = MeasuredPoints.of(self.points, drives, images, settled, mount.lever)
         return replace(segments, points=points)
 
-    def _yaws(self) -> Iterator[Array]:
-        """Headings rad of the odometry at the images of each drive."""
-        for track, drive in zip(self.tracks(), self.items, strict=True):
-            yield Headings.of(track, drive.stamps_ns, drive.seen).track
-
     @property
     def _camera_yaw(self) -> Array:
-        """By how much the camera is turned on the robot, rad, of each image (N,)."""
+        """Yaw of the camera on the robot, rad, of each image (N,)."""
         yaw = self.mount.of(len(self.items)).yaw
         return np.repeat(yaw, [len(drive.run.panoramas) for drive in self.items])
 
     def measured(self, views: Views, sphere: Sphere) -> Drives:
-        """With the offsets of `views`, which the graph of odometry and closures leads to, and the
-        place of the camera, which both show together."""
-        turns = np.concatenate(list(self._yaws()))[views.images]
+        """With the offsets of `views`, near the poses of the graph of odometry and closures, and
+        the camera's place on the robot, which both determine together."""
+        headings = self._headings(self.tracks())
+        turns = np.concatenate([each.track for each in headings])[views.images]
         mount = replace(self.mount, turning=lever_square(views, turns))
         drives, count = replace(self, mount=mount), int(views.images.max()) + 1
         for _ in range(_MOUNT_ROUNDS):
@@ -164,29 +149,29 @@ class Drives:
                 )  # fmt: skip
         return drives
 
-    def shown(self, result: MetricResult) -> Iterator[tuple[Stamps, Array]]:
-        """Of each drive the stamps (M,) of its images in the segments, and x m, y m, yaw rad (M, 3)
-        of base_link at these by the map."""
+    def image_poses(self, result: MetricResult) -> Iterator[tuple[Stamps, Array]]:
+        """Of each drive the stamps (M,) of its images in the segments, and poses (M, 3) of
+        base_link at these by the map: x m, y m, yaw rad."""
         poses = result.poses - np.pad(result.residuals, ((0, 0), (0, 1)))
         for number, (drive, start) in enumerate(zip(self.items, self.starts, strict=True)):
             rows = result.images - start
-            own = (rows >= 0) & (rows < len(drive.stamps_ns))
-            yield drive.stamps_ns[rows[own]], result.mount.base(poses[own], number)
+            inside = (rows >= 0) & (rows < len(drive.stamps_ns))
+            yield drive.stamps_ns[rows[inside]], result.mount.base(poses[inside], number)
 
     def ways(self, segments: Segments, result: MetricResult) -> list[Way | None]:
         """The way of each drive by the map, where its wheels lose some in turns.
 
-        All have the same scale: it is that of the map, and no drive is better known by itself.
+        All have one scale, that of the map: single drives do not show it better.
         """
-        drives = zip(self.tracks(), self.shown(result), segments.ways, strict=True)
-        found = [way_of(track, *shown, way) for track, shown, way in drives]
-        scales = [way.scale for way in found if way]
-        return [way and way._replace(scale=float(np.mean(scales))) for way in found]
+        drives = zip(self.tracks(), self.image_poses(result), segments.ways, strict=True)
+        ways = [way_of(track, *images, way) for track, images, way in drives]
+        scales = [way.scale for way in ways if way]
+        return [way and way._replace(scale=float(np.mean(scales))) for way in ways]
 
 
 def rig_of(drives: Drives, segments: Segments) -> Rig:
     """What was learned of the robot."""
-    usual, delays = Rig(), [drive.delay_s for drive in drives.items if drive.delay_s is not None]
+    usual, delays = Rig(), [d.delay_ns * 1e-9 for d in drives.items if d.delay_ns is not None]
     ways = np.array([way or Way(loss_std=usual.turn_loss.std) for way in segments.ways])
     scale_std = segments.points.settled.scale_std if segments.points else SCALE_STD
     scale, loss, _ = ways.mean(axis=0).tolist()
@@ -199,10 +184,9 @@ def rig_of(drives: Drives, segments: Segments) -> Rig:
 
 
 def compare_with_map(checks: Sequence[MotionCheck], drives: Drives, result: MetricResult) -> None:
-    """Add to what the sources of each drive's motion tell how far the images moved by the map."""
-    shown = drives.shown(result)
-    for check, drive, (stamps_ns, poses) in zip(checks, drives.items, shown, strict=True):
-        pair = compare_map(drive.run.odometry, stamps_ns, poses)
+    """Add the comparison of the map with the odometry to each drive's."""
+    for check, drive, images in zip(checks, drives.items, drives.image_poses(result), strict=True):
+        pair = compare_map(drive.run.odometry, *images)
         check.pairs += [pair] if pair else []
 
 
@@ -211,8 +195,8 @@ def learn_map(
 ) -> tuple[Segments, MetricResult]:
     """Segments, and the certified map from features (N, K) of all images to them: section 3.
 
-    Where the map shows that wheels lose way in turns, it is learned once more without that. Raises
-    DataError; `strict` also for a single route, of which else a warning says so.
+    Where it shows that wheels lose way in turns, it is learned again with the corrected way. Raises
+    DataError; a single route is an error with `strict`, else a warning.
     """
     segments = drives.cut()
     result = learn_metric(features, segments, config, seed)
@@ -221,8 +205,8 @@ def learn_map(
         if not any(ways):
             break
         try:
-            shorter = drives.cut(ways)
-            segments, result = shorter, learn_metric(features, shorter, config, seed)
+            corrected = drives.cut(ways)
+            segments, result = corrected, learn_metric(features, corrected, config, seed)
         except DataError as error:
             logger.warning('the way that wheels lose in turns stays in the map: %s', error)
             break

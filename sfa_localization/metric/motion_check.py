@@ -1,8 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is wrong with a drive's sources of motion, what of it is corrected, and what to change.
+"""Which sources of a drive's motion are faulty, which of them are corrected, and what to change.
 
-Where sources differ, those are to blame that fewer devices agree with; the wheels are one device.
+Where sources disagree, the minority is reported as faulty; pose and twist, both of the wheels, have
+one vote together.
 """
 
 from __future__ import annotations
@@ -42,17 +43,18 @@ from sfa_localization.metric.motion_sources import (
 logger = logging.getLogger(__name__)
 
 SKIDDING = 5.0
-"""Wheels that skid are off by two: a larger factor is that of another unit, axis or source."""
+"""Skidding wheels are off by a factor of two: more is another unit, axis or source."""
 FASTEST_MPS = 30.0
-"""Robots on the ground are slower: numbers beyond are not in meters."""
-ASIDE, SLIGHT_TURN = 0.25, 1.0
-"""So much of the way ahead no robot slips sideways while it turns by less than this, rad, in a
-second, nor does one whose frame is off its axle; twice that is no slip at all."""
+"""A faster robot publishes other units than meters."""
+SIDEWAYS, SLIGHT_TURN = 0.25, 1.0
+"""Nothing slips sideways by more than this share of the way ahead while it turns by less than the
+second, rad, in a second, not even the frame of a robot beside its axle; twice that is no slip."""
 ASKEW, UNEVEN = np.deg2rad(1.0), np.deg2rad(10.0)
-"""A heading that lies farther beside the way, as of a gyroscope that is mounted askew, is corrected
-where half of the ways lie less than the second from it: those of wheels that slip do not."""
-# Stamps, in all and in each second, of which the unit can be told.
+"""A heading that is farther beside the way, as of a gyroscope that is mounted askew, is corrected
+where the spread is below the second: slipping wheels spread more."""
+# Fewer stamps, in all and in each second, do not show their unit.
 _STAMPS_MIN, _STAMPS_MIN_PER_S = 20, 3
+_UNITS = ((1, 'nothing'), (1_000, 'milliseconds'), (1_000_000, 'microseconds'))
 _IMAGES_REMEDIES = {
     'alike': 'switch direction lock and stabilization off, and record one omnidirectional camera',
     'sign': 'set `clockwise` of the panorama, or `mirrored` of the calibration',
@@ -63,8 +65,8 @@ _IMAGES_REMEDIES = {
 
 @dataclass
 class MotionCheck:
-    """What the sources of a drive tell of each other, in sentences: what cannot be right (`wrong`),
-    what is `corrected` in `odometry` and `gyro`, and what is worth a word (`notes`).
+    """Comparisons of a drive's sources, `odometry` and `gyro` as corrected, and sentences: on what
+    is `wrong`, was `corrected`, or is worth noting.
     """
 
     pairs: list[Pair]
@@ -81,46 +83,43 @@ class MotionCheck:
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         rows = [dict(zip(HEAD, pair.row(), strict=True)) for pair in self.pairs]
-        said = {name: getattr(self, name) for name in ('wrong', 'corrected', 'notes')}
-        return {'pairs': rows, **said}
+        sentences = {name: getattr(self, name) for name in ('wrong', 'corrected', 'notes')}
+        return {'pairs': rows, **sentences}
 
     def as_text(self) -> list[str]:
-        """Lines for a terminal: the table of pairs, and the sentences but for what is wrong."""
+        """Lines for a terminal: the table of pairs, corrections and notes."""
         rows = [HEAD, *(pair.row() for pair in self.pairs)] if self.pairs else []
-        wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        table = ['  '.join(map(str.ljust, row, wide)).rstrip() for row in rows]
-        said = [f'corrected: {text}' for text in self.corrected]
-        return [*table, *said, *(f'note: {text}' for text in self.notes)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        table = ['  '.join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        corrected = [f'corrected: {text}' for text in self.corrected]
+        return [*table, *corrected, *(f'note: {text}' for text in self.notes)]
 
 
 def check_drives(
     runs: Sequence[Run],
-    seen: Sequence[Sequence[float]],
+    headings: Sequence[Sequence[float]],
     force: bool = False,
     textures: Sequence[NDArray[np.int8] | None] = (),
 ) -> tuple[tuple[Run, ...], tuple[MotionCheck, ...]]:
-    """Drives to learn from, corrected, and what their sources of motion tell.
+    """Corrected drives, and the comparisons of their sources of motion.
 
-    `seen` are the headings (N,) rad that the images of each run show, and `textures` (N, rows,
-    columns) small ones of these, to find breaks by. Raises DataError for what
-    cannot be right, of which `force` only warns.
+    `headings` (N,) rad of each run are the sums of the shifts between its images, and `textures`
+    (N, rows, columns) small versions of these, which show breaks. Raises DataError if a source is
+    wrong; with `force` it only warns.
     """
-    checks = []
-    for run, headings, views in zip(runs, seen, textures or [None] * len(runs), strict=True):
+    checks, corrected = [], []
+    for run, yaw, small in zip(runs, headings, textures or [None] * len(runs), strict=True):
         stamps_ns = run.panoramas.stamps_ns
-        shown = stamps_ns, np.asarray(headings, float)
-        given = None if views is None else (stamps_ns, views)
-        check = check_motion(run.odometry, shown, run.yaw_rate, views=given)
+        views = None if small is None else (stamps_ns, small)
+        images = stamps_ns, np.asarray(yaw, float)
+        check = check_motion(run.odometry, images, run.yaw_rate, views=views)
         for text in check.corrected + check.notes + (check.wrong if force else []):
             logger.warning('%s: %s', run.name, text)
         if check.wrong and not force:
             raise DataError(f'{run.name}: {"; ".join(check.wrong)} (train --force goes on)')
         checks.append(check)
-    corrected = tuple(
-        replace(run, odometry=check.odometry, yaw_rate=check.gyro)
-        for run, check in zip(runs, checks, strict=True)
-    )
-    return corrected, tuple(checks)
+        corrected.append(replace(run, odometry=check.odometry, yaw_rate=check.gyro))
+    return tuple(corrected), tuple(checks)
 
 
 def check_motion(
@@ -130,21 +129,21 @@ def check_motion(
     panoramas: bool = True,
     views: Textures | None = None,
 ) -> MotionCheck:
-    """Compare all sources of a drive: see `sources_of`.
+    """Compare all sources of a drive: see `sources_of`, and `contradicted` for the `views`.
 
-    `views` are stamps (N,) of images that repeat none, and their small textures; see breaks.py. Of
-    images that are no `panoramas` yet, nobody knows which way around they turn, and how far.
+    The direction and scale of turns in images that are no `panoramas` yet are unknown.
     """
-    sources = sources_of(odometry, images, gyro)
-    impossible = list(_impossible(sources))
+    impossible = list(_impossible(sources_of(odometry, images, gyro)))
     check = MotionCheck([], odometry, gyro, list(impossible))
     if not impossible:
-        _correct_poses(check)
-        sources = sources_of(check.odometry, images, gyro)
-    pairs = [compare(*two, what) for what in ('turns', 'way') for two in combinations(sources, 2)]
+        for change in parted, _straightened:
+            check.odometry, text = change(check.odometry)
+            check.corrected += [text] if text else []
+    sources = sources_of(check.odometry, images, gyro)
+    pairs = [compare(a, b, what) for what in ('turns', 'way') for a, b in combinations(sources, 2)]
     check.pairs = [pair for pair in pairs if pair]
-    shown = check.pair(POSE, IMAGES)
-    if images is not None and not panoramas and shown and shown.scale < 0:
+    turns = check.pair(POSE, IMAGES)
+    if images is not None and not panoramas and turns and turns.scale < 0:
         return check_motion(odometry, (images[0], -images[1]), gyro, panoramas, views)
     _judge_way(check)
     if not impossible:
@@ -152,7 +151,7 @@ def check_motion(
         _judge_turns(check)
         _judge_clocks(check)
         if views is not None:
-            late_ns = round(shown.late_s * 1e9) if shown else 0
+            late_ns = round(turns.late_s * 1e9) if turns else 0
             check.odometry, texts = contradicted(check.odometry, views[0] - late_ns, views[1])
             check.corrected += texts
     if images is not None and not any(IMAGES in (pair.a, pair.b) for pair in check.pairs):
@@ -164,18 +163,32 @@ def check_motion(
 
 
 def _impossible(sources: Sequence[Source]) -> Iterator[str]:
-    """What no robot does, whatever it is compared with."""
+    """Stamps in other units, and speeds that no robot reaches."""
     for source in sources:
-        problem = stamp_problem(source.stamps_ns)
+        problem = _stamp_problem(source.stamps_ns)
         if problem and source.name != TWIST:
             yield f'{source.name}: {problem}'
-        elif not problem and (speed := _speed(source)) > FASTEST_MPS:
-            yield f'{source.name} drives at {speed:.3g} m/s: publish meters, not millimeters'
+        elif not problem and 'way' in source.sums:
+            # The 90th percentile of the mean speeds of whole seconds, m/s.
+            seconds = (source.stamps_ns - source.stamps_ns[0]) * 1e-9
+            way = np.interp(np.arange(seconds[-1] + 1), seconds, source.sums['way'])
+            if (speed := np.percentile(np.abs(np.diff(way)), 90)) > FASTEST_MPS:
+                yield f'{source.name} drives at {speed:.3g} m/s: publish meters, not millimeters'
+
+
+def _stamp_problem(stamps_ns: Stamps) -> str:
+    """Which unit the nanoseconds of stamps (N,) have instead, in words; '' if they are right."""
+    second, part = np.divmod(stamps_ns, 1_000_000_000)
+    if len(second) < max(_STAMPS_MIN, _STAMPS_MIN_PER_S * len(np.unique(second))):
+        return ''
+    name = next((name for limit, name in _UNITS if part.max() < limit), '')
+    remedy = 'correct the driver, or set stamp_source: receive'
+    return f'nanosec of its stamps holds {name}: {remedy}' if name else ''
 
 
 def _ahead(odometry: Odometry) -> Complex:
-    """The way of each second, m, along (real) and to the left of the mean heading in it, of those
-    with little turn: a chord shows where the robot was heading, where that turned by little.
+    """The way of each second, m, along (real) and to the left of its mean heading. Seconds with
+    much turn are left out: their chord does not show the heading.
     """
     stamps, poses = odometry.stamps_ns, odometry.poses
     at = np.flatnonzero(np.diff((stamps - stamps[0]) // 1_000_000_000, prepend=-1))
@@ -185,66 +198,36 @@ def _ahead(odometry: Odometry) -> Complex:
     return np.asarray(chord[whole & (np.abs(chord) > JUMP) & (np.abs(step[:, 2]) < SLIGHT_TURN)])
 
 
-def _correct_poses(check: MotionCheck) -> None:
-    """Join or cut where poses jump, and turn them along their way."""
-    for change in parted, _straightened:
-        check.odometry, text = change(check.odometry)
-        check.corrected += [text] if text else []
-
-
 def _straightened(odometry: Odometry) -> tuple[Odometry, str]:
-    """Odometry that heads along its way, ahead or back, and a sentence; '' for no change."""
+    """Odometry that heads along its way, forward or backward, and a sentence; '' if it did."""
     way = _ahead(odometry)
     if np.abs(way).sum() < ENOUGH['way']:
         return odometry, ''
-    beside = np.angle(way * np.where(way.real < 0, -1, 1))
-    off = quantile(beside, 0.5, np.abs(way))
-    spread = MEDIAN_TO_STD * quantile(np.abs(beside - off), 0.5, np.abs(way))
+    bearing = np.angle(way * np.where(way.real < 0, -1, 1))
+    off = quantile(bearing, 0.5, np.abs(way))
+    spread = MEDIAN_TO_STD * quantile(np.abs(bearing - off), 0.5, np.abs(way))
     chance = NOISE * spread / np.sqrt(len(way))
     if not max(ASKEW, chance) < abs(off) < np.pi / 4 or spread > UNEVEN:
         return odometry, ''
     poses = odometry.poses.copy()
     poses[:, 2] = wrap_angle(poses[:, 2] + off)
-    text = (
-        f'the heading of the pose lies {np.rad2deg(abs(off)):.1f} degrees beside its way: corrected'
-    )
+    degrees = np.rad2deg(abs(off))
+    text = f'the heading of the pose lies {degrees:.1f} degrees beside its way: corrected'
     return replace(odometry, poses=poses), text
 
 
 def _judge_axes(check: MotionCheck) -> None:
-    """Whether poses drive ahead or back, second by second, as wheels do."""
+    """Whether poses move along their heading, as wheels do."""
     way = _ahead(check.odometry)
-    ahead, aside = np.abs(way.real).sum(), np.abs(way.imag).sum()
-    if aside > max(ENOUGH['way'], ASIDE * ahead):
-        text = f'{POSE} drives {aside:.3g} m sideways and {ahead:.3g} m ahead: correct its heading'
-        text += ' and axes (x ahead, y to the left, yaw counterclockwise)'
-        (check.wrong if aside > 2 * ASIDE * ahead else check.notes).append(text)
-
-
-def stamp_problem(stamps_ns: Stamps) -> str:
-    """What is wrong with the unit of stamps (N,), in words; '' for nothing."""
-    second, part = np.divmod(stamps_ns, 1_000_000_000)
-    if len(second) < max(_STAMPS_MIN, _STAMPS_MIN_PER_S * len(np.unique(second))):
-        return ''
-    units = ((1, 'nothing'), (1_000, 'milliseconds'), (1_000_000, 'microseconds'))
-    wrong = next((name for limit, name in units if part.max() < limit), '')
-    remedy = 'correct the driver, or set stamp_source: receive'
-    return f'nanosec of its stamps holds {wrong}: {remedy}' if wrong else ''
-
-
-def _speed(source: Source) -> float:
-    """Speed that is exceeded a tenth of the time, by whole seconds, m/s; 0 where none is shown."""
-    if source.driven is None:
-        return 0.0
-    seconds = (source.stamps_ns - source.stamps_ns[0]) * 1e-9
-    at = np.flatnonzero(np.diff(np.floor(seconds), prepend=-1.0))
-    driven = np.diff(source.driven[at])
-    speed = np.abs(driven) / np.maximum(np.diff(seconds[at]), 0.1)
-    return float(np.percentile(speed, 90)) if len(speed) else 0.0
+    ahead, sideways = np.abs(way.real).sum(), np.abs(way.imag).sum()
+    if sideways > max(ENOUGH['way'], SIDEWAYS * ahead):
+        text = f'{POSE} drives {sideways:.3g} m sideways and {ahead:.3g} m ahead: correct its '
+        text += 'heading and axes (x ahead, y to the left, yaw counterclockwise)'
+        (check.wrong if sideways > 2 * SIDEWAYS * ahead else check.notes).append(text)
 
 
 def _judge_way(check: MotionCheck) -> None:
-    """Pose and twist of the odometry, by the way that they drive."""
+    """The ways of pose and twist."""
     pair = check.pair(POSE, TWIST, 'way')
     if pair is None:
         return
@@ -257,88 +240,77 @@ def _judge_way(check: MotionCheck) -> None:
         )
     elif pair.differs('scale'):
         text = f'{TWIST} drives {pair.scale:.3g} times as far as {POSE}{unit(pair)}'
-        far = not 1 / SKIDDING < pair.scale < SKIDDING
-        (check.wrong if far else check.notes).append(f'{text}: publish m and m/s')
+        skids = 1 / SKIDDING < pair.scale < SKIDDING
+        (check.notes if skids else check.wrong).append(f'{text}: publish m and m/s')
 
 
 def _judge_turns(check: MotionCheck) -> None:
-    """Say of each way in which sources differ which of them do, and correct the gyroscope."""
-    left = {name for pair in check.pairs if pair.what == 'turns' for name in (pair.a, pair.b)}
+    """Report the minority for each kind of difference."""
+    pairs = [pair for pair in check.pairs if pair.what == 'turns']
+    names = {name for pair in pairs for name in (pair.a, pair.b)}
     for kind in ('alike', 'sign', 'scale'):
-        camps = _camps(check.pairs, kind, left)
-        for camp in camps[1:]:
-            _blame(check, kind, camp, camps[0])
-            left -= camp if kind == 'alike' else set()
+        groups = _groups(pairs, kind, names)
+        for minority in groups[1:]:
+            between = [p for p in pairs if {p.a, p.b} & minority and {p.a, p.b} & groups[0]]
+            if between:
+                _report(check, kind, minority, groups[0], between[0])
+            names -= minority if kind == 'alike' else set()
 
 
-def _camps(pairs: Sequence[Pair], kind: str, names: set[str]) -> list[set[str]]:
-    """Groups of sources that do not differ in a way; that of most devices, or the pose, first."""
-    camps = [{name} for name in names]
+def _groups(pairs: Sequence[Pair], kind: str, names: set[str]) -> list[set[str]]:
+    """Sources that agree with each other; the group of most devices, or of the pose, first."""
+    groups = [{name} for name in names]
     for pair in pairs:
-        if pair.what == 'turns' and {pair.a, pair.b} <= names and not pair.differs(kind):
-            joined = [camp for camp in camps if camp & {pair.a, pair.b}]
-            camps = [camp for camp in camps if camp not in joined] + [set().union(*joined)]
-    return sorted(camps, key=lambda camp: (-_devices(camp), POSE not in camp, min(camp)))
+        if {pair.a, pair.b} <= names and not pair.differs(kind):
+            joined = [group for group in groups if group & {pair.a, pair.b}]
+            groups = [group for group in groups if group not in joined] + [set().union(*joined)]
+    return sorted(groups, key=lambda group: (-_devices(group), POSE not in group, min(group)))
 
 
-def _devices(camp: set[str]) -> int:
-    """Pose and twist come from the same wheels."""
-    return len({'wheels' if name in (POSE, TWIST) else name for name in camp})
+def _devices(group: set[str]) -> int:
+    return len({'wheels' if name in (POSE, TWIST) else name for name in group})
 
 
-def _blame(check: MotionCheck, kind: str, camp: set[str], others: set[str]) -> None:
-    """Say how a camp of sources differs from the others."""
-    between = [
-        pair
-        for pair in check.pairs
-        if pair.what == 'turns' and {pair.a, pair.b} & camp and {pair.a, pair.b} & others
-    ]
-    if not between:
-        return
-    pair = between[0]
-    factor = abs(pair.scale) if pair.b in camp else 1 / max(abs(pair.scale), 1e-9)
+def _report(check: MotionCheck, kind: str, group: set[str], others: set[str], pair: Pair) -> None:
+    """Report how a group of sources differs from the others, by one `pair` of both."""
+    factor = abs(pair.scale) if pair.b in group else 1 / max(abs(pair.scale), 1e-9)
     how = {
         'alike': 'independently of' if pair.independent else 'unlike',
         'sign': 'opposite to',
         'scale': f'{factor:.3g} times as far{unit(pair)} as',
     }[kind]
-    verb = 'turn' if camp == {IMAGES} else 'turns'
-    text = f'{_listed(camp)} {verb} {how} {_listed(others)}'
-    far = kind == 'scale' and not 1 / SKIDDING < factor < SKIDDING
-    if GYRO in camp:
-        _correct(check, kind, text, factor)
+    text = f'{_listed(group)} {"turn" if group == {IMAGES} else "turns"} {how} {_listed(others)}'
+    drastic = kind == 'sign' or (kind == 'scale' and not 1 / SKIDDING < factor < SKIDDING)
+    if GYRO in group:
+        _correct_gyro(check, kind, text, factor)
         return
-    if camp == {IMAGES}:
+    if group == {IMAGES}:
         remedy = _IMAGES_REMEDIES[kind]
-        remedy += (
-            ', or swap left and right wheel' if (kind, _devices(others)) == ('sign', 1) else ''
-        )
-        # Alone, wheels that skid turn farther than the robot does.
-        blamed = factor > 1 or _devices(others) > 1
-        wrong = {'alike': pair.independent, 'sign': True, 'scale': blamed}[kind]
-    elif camp >= {POSE, TWIST}:
+        if kind == 'sign' and _devices(others) == 1:
+            remedy += ', or swap left and right wheel'
+        # Skidding wheels turn farther than the robot does.
+        images_err = factor > 1 or _devices(others) > 1
+        wrong = {'alike': pair.independent, 'sign': True, 'scale': images_err}[kind]
+    elif group >= {POSE, TWIST}:
         remedy = 'swap left and right wheel' if kind == 'sign' else 'do the wheels skid?'
-        wrong = kind == 'sign' or far
+        wrong = drastic
     else:
-        remedy = 'correct its orientation' if POSE in camp else 'correct twist.angular.z, in rad/s'
-        wrong = kind != 'scale' or far
+        remedy = 'correct its orientation' if POSE in group else 'correct twist.angular.z, in rad/s'
+        wrong = drastic or kind == 'alike'
     (check.wrong if wrong else check.notes).append(f'{text}: {remedy}')
 
 
-def _listed(camp: set[str]) -> str:
-    """Names of sources, in words."""
-    wheels = sorted(camp & {POSE, TWIST})
-    return ' and '.join(
-        [*(['odometry'] if len(wheels) == 2 else wheels), *sorted(camp - {*wheels})]
-    )
+def _listed(group: set[str]) -> str:
+    """The names of sources, in words."""
+    wheels = ['odometry'] if {POSE, TWIST} <= group else sorted(group & {POSE, TWIST})
+    return ' and '.join([*wheels, *sorted(group - {POSE, TWIST})])
 
 
-def _correct(check: MotionCheck, kind: str, text: str, factor: float) -> None:
-    """Turn, convert or leave out the gyroscope."""
+def _correct_gyro(check: MotionCheck, kind: str, text: str, factor: float) -> None:
+    """Mirror, convert or leave out the gyroscope."""
     if check.gyro is None:
         return
-    omega, variance = check.gyro.omega, check.gyro.variance
-    degree = np.pi / 180
+    omega, variance, degree = check.gyro.omega, check.gyro.variance, np.pi / 180
     if kind == 'sign':
         check.corrected.append(f'{text}: taken as upside down')
         check.gyro = replace(check.gyro, omega=-omega)
@@ -353,7 +325,7 @@ def _correct(check: MotionCheck, kind: str, text: str, factor: float) -> None:
 
 
 def _judge_clocks(check: MotionCheck) -> None:
-    """Correct the stamps of the gyroscope; those of images are corrected by the training."""
+    """Correct the stamps of the gyroscope; the training corrects those of images."""
     if check.gyro is not None and not check.odometry.trajectory.covers(check.gyro.stamps_ns).any():
         check.corrected.append(f'{GYRO}: stamped by another clock than the odometry; left out')
         check.gyro = None
@@ -361,9 +333,9 @@ def _judge_clocks(check: MotionCheck) -> None:
         pair = check.pair(POSE, name)
         if pair is None or pair.differs('alike') or not pair.late_s:
             continue
-        if name == IMAGES and abs(pair.late_s) * 1e9 > DELAY_LIMIT_NS:
-            continue  # clocks that are so far apart are a reason of their own to stop
+        late_ns = round(pair.late_s * 1e9)
+        if name == IMAGES and abs(late_ns) > DELAY_LIMIT_NS:
+            continue  # reported as a lack of its own
         if name == GYRO and check.gyro is not None:
-            stamps = check.gyro.stamps_ns - round(pair.late_s * 1e9)
-            check.gyro = replace(check.gyro, stamps_ns=stamps)
+            check.gyro = replace(check.gyro, stamps_ns=check.gyro.stamps_ns - late_ns)
         check.corrected.append(f'{name}: stamped {late(pair.late_s)}; taken into account')

@@ -1,131 +1,130 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether all sources tell the same motion of a drive: images, odometry pose and twist, gyroscope.
+"""Whether all sources of motion agree on a drive: images, odometry pose and twist, gyroscope.
 
-Of each pair, the turns (and the way) in short windows are compared by regression of one on the
-other, over a grid of delays: the sign, the scale, the delay and the correlation show which source
-is mirrored, has another unit, runs by another clock, or shows something else. No map is needed.
+Two sources are compared by their turns, or their ways, in short windows: one is regressed on the
+other over a grid of delays. Scale, delay and correlation show whether a source is mirrored, has
+another unit, runs by another clock or measures another motion. No map is needed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from sfa_localization.data.geometry import Array, Mask, relative, wrap_angle
+from sfa_localization.data.events import CLOCK_RANGE_S
+from sfa_localization.data.geometry import Array, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, parabola_peak, quantile
-from sfa_localization.metric.dead_reckoning import summed
+from sfa_localization.metric.dead_reckoning import summed, without_pause
 
 IMAGES, POSE, TWIST, GYRO = 'images', 'odometry pose', 'odometry twist', 'gyroscope'
 MAP = 'map'
-LONGEST_S = 2.5
-"""Clocks farther apart are not recognized."""
 ALIKE, UNLIKE = 0.7, 0.3
-"""Two sources with a correlation above the first show the same motion (half of the variance), those
-below the second do not: between them, nothing is said."""
+"""Sources correlated by more than the first measure the same motion (half of the variance); below
+the second they are independent. Between them nothing is certain."""
 ENOUGH = {'turns': 2 * np.pi, 'way': 2.0}
-"""Turned (rad) or driven (m) in sum: less does not show how well two sources agree."""
+"""Least sum of turns (rad) or way (m) for a comparison."""
 LOCKED = 0.4
-"""Images that turn by less than this share do not turn with the robot; skidding wheels turn twice
-as far as it does."""
+"""Images that turn by less than this share are stabilized by the camera; skidding wheels turn twice
+as far as the robot."""
 EQUAL = 1.5
-"""A larger factor between two sources is none of sampling or of a loosely calibrated wheel."""
+"""Larger ratios of two sources are neither sampling nor loosely calibrated wheels; a ratio that is
+that of two units within this factor is explained by them."""
 WHOLE, CERTAIN = 1.15, 0.95
-"""Panoramas that turn as the robot does, with a correlation of at least the second, and by another
-factor than this, do not show a whole turn; those that do were found to be within 3 %."""
-UNIT = 1.2
-"""A scale within this factor of that between two units is taken for it."""
+"""The stricter limit for images whose correlation exceeds the second: panoramas that show a whole
+turn were within 3 %."""
 LATE_S = 0.05
-"""A smaller delay is within the period of usual messages."""
-# Windows last from _SHORTEST_S until half of the motion lies in windows with _STEP (rad, m) or
-# more, at most _LONGEST_WINDOW_S; none crosses a pause.
-_SHORTEST_S, _LONGEST_WINDOW_S, _STEP, _PAUSE_S = 0.19, 3.0, 0.1, 1.0
-_GRID = np.arange(-50, 51) * (LONGEST_S / 50)
-# A step beyond so many usual ones is an outlier, and counts as that.
-_OUTLIER = 3.0
-# More windows tell nothing new.
-_WINDOWS = 3000
-# A delay is known where delays that fit about as well spread by less, s (of a quarter of them).
+"""Smaller delays are within the period of usual messages."""
+# Windows are lengthened until half of the motion is in windows with _STEP (rad, m) or more.
+_WINDOWS_S, _STEP, _WINDOWS_MAX = 0.19 * 2.0 ** np.arange(4), 0.1, 3000
+_PAUSE_S = 1.0
+_GRID = np.arange(-50, 51) * (CLOCK_RANGE_S / 50)
+_OUTLIER = 3.0  # times the typical step
+# A delay is certain where those that fit about as well spread by less, s (of a quarter of them).
 _STD_MAX_S = 0.06
-# m of way over which a map is compared with odometry: much more than images err in it.
+# Maps are compared with odometry over so many m: much more than one image errs.
 _STRETCH_M = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """What one source tells of a drive at increasing stamps (N,): the sum of its turns, rad, and
-    of its way ahead, m; None where it tells nothing of them.
+    """What one source measured at increasing stamps (N,): `sums` (N,) of 'turns', rad, and of the
+    'way' ahead, m, or of one of them.
     """
 
     name: str
     stamps_ns: Stamps
-    turned: Array | None
-    driven: Array | None = None
+    sums: dict[str, Array]
 
     @property
     def period_s(self) -> float:
-        """Between messages, as usual."""
-        return float(np.median(np.diff(self.stamps_ns))) * 1e-9
+        """Mean time between messages, which may come in bundles."""
+        return float(self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9 / (len(self.stamps_ns) - 1)
 
-    def sums(self, what: str) -> Array | None:
-        return self.turned if what == 'turns' else self.driven
+    def moved(self, windows: Stamps, what: str) -> Array:
+        """The motion (...) in windows (..., 2) ns."""
+        start = self.stamps_ns[0]
+        seconds = (self.stamps_ns - start) * 1e-9
+        at = np.interp((windows - start) * 1e-9, seconds, self.sums[what])
+        return np.asarray(np.diff(at)[..., 0])
 
 
 def sources_of(
     odometry: Odometry, images: tuple[Stamps, Array] | None = None, gyro: YawRate | None = None
 ) -> list[Source]:
-    """The sources of a drive; those that say nothing are left out.
+    """The sources of a drive that have more than two messages.
 
-    `images` are their stamps (N,) and the headings (N,) rad that their shifts add up to.
+    `images` are their stamps (N,) and headings (N,) rad: the sums of the shifts between them.
     """
     step = relative(odometry.poses[:-1], odometry.poses[1:])
     half, seconds = step[:, 2] / 2, np.diff(odometry.stamps_ns) * 1e-9
     ahead = step[:, 0] * np.cos(half) + step[:, 1] * np.sin(half)
-    v, omega = (odometry.twists[1:] * seconds[:, None]).T
-    found = [Source(POSE, odometry.stamps_ns, summed(wrap_angle(step[:, 2])), summed(ahead))]
-    # What is always 0 is not filled in.
-    filled = [summed(twist) if twist.any() else None for twist in (omega, v)]
-    found.append(Source(TWIST, odometry.stamps_ns, *filled))
+    # Drivers leave at 0 what they do not measure.
+    rates = zip(('way', 'turns'), (odometry.twists[1:] * seconds[:, None]).T, strict=True)
+    twist = {what: summed(moved) for what, moved in rates if moved.any()}
+    pose = {'turns': summed(wrap_angle(step[:, 2])), 'way': summed(ahead)}
+    sources = [Source(POSE, odometry.stamps_ns, pose), Source(TWIST, odometry.stamps_ns, twist)]
     if gyro is not None:
         areas = (gyro.omega[1:] + gyro.omega[:-1]) / 2 * np.diff(gyro.stamps_ns) * 1e-9
-        found.append(Source(GYRO, gyro.stamps_ns, summed(areas)))
+        sources.append(Source(GYRO, gyro.stamps_ns, {'turns': summed(areas)}))
     if images is not None:
-        found.append(Source(IMAGES, images[0], np.unwrap(images[1])))
-    return [one for one in found if len(one.stamps_ns) > 2]
+        sources.append(Source(IMAGES, images[0], {'turns': np.unwrap(images[1])}))
+    return [source for source in sources if len(source.stamps_ns) > 2]
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """What source `b` tells compared with `a`: `scale` times as much (negative: the other way
-    around), `delay_s` later, where `delay_known`, with this `correlation` (0 to 1).
+    """Source `b` compared with `a` by `what`: `scale` times as much (negative: opposite), `delay_s`
+    later (None: uncertain), with a `correlation` from 0 to 1.
     """
 
     what: str
     a: str
     b: str
     scale: float
-    delay_s: float
-    delay_known: bool
+    delay_s: float | None
     correlation: float
-    period_s: float
-    """Of the slower one of both, images left out: a mean rate is late by half of it."""
+    period_s: float = 0.0
+    """Of the slower source, without images: a mean rate is late by half of it."""
 
     @property
     def late_s(self) -> float:
-        """By how much `b` is stamped later; 0 where that is not known, or too little to matter."""
+        """The delay of `b`; 0 if it is uncertain, or too small to matter."""
         least = max(LATE_S, self.period_s)
-        return self.delay_s if self.delay_known and abs(self.delay_s) > least else 0.0
+        return self.delay_s if self.delay_s is not None and abs(self.delay_s) > least else 0.0
 
     @property
     def independent(self) -> bool:
-        """Whether `b` does not move with `a`: what is near still moves in images held by a lock."""
+        """Whether `b` does not move with `a`. Images of a stabilized camera correlate a little, by
+        the parallax of near things.
+        """
         locked = self.b == IMAGES and abs(self.scale) < LOCKED
         return self.correlation < UNLIKE or locked
 
     def differs(self, kind: str) -> bool:
-        """Whether the sources differ: they are not ALIKE, turn opposite, or not equally far."""
+        """Whether the two differ in this: they are not 'alike', or differ by 'sign' or 'scale'."""
         if kind == 'alike':
             return self.correlation < ALIKE or self.independent
         if kind == 'sign':
@@ -133,9 +132,13 @@ class Pair:
         limit = WHOLE if self.b == IMAGES and self.correlation >= CERTAIN else EQUAL
         return not 1 / limit < abs(self.scale) < limit
 
-    def sentence(self) -> str:
-        """What it means, in words."""
-        verb = {'turns': 'turns', 'way': 'drives'}[self.what]
+    def row(self) -> tuple[str, ...]:
+        """Cells of a table with the columns HEAD."""
+        delay = '' if self.delay_s is None else f'{round(self.delay_s, 2) + 0.0:.2f}'
+        numbers = f'{self.scale:.3g}', delay, f'{self.correlation:.2f}'
+        return f'{self.b} by {self.a}', self.what, *numbers, self._meaning()
+
+    def _meaning(self) -> str:
         if self.differs('alike'):
             return 'not alike' if self.independent else 'hardly alike'
         parts = ['the other way around'] if self.scale < 0 else []
@@ -143,14 +146,8 @@ class Pair:
             parts.append(f'{abs(self.scale):.3g} times as far{unit(self)}')
         if self.late_s:
             parts.append(late(self.late_s))
+        verb = 'turns' if self.what == 'turns' else 'drives'
         return f'{self.b} {verb} {", ".join(parts)}' if parts else 'alike'
-
-    def row(self) -> tuple[str, ...]:
-        """Cells of a table; see HEAD."""
-        delay = f'{round(self.delay_s, 2) + 0.0:.2f}' if self.delay_known else ''
-        names = f'{self.b} by {self.a}'
-        numbers = f'{self.scale:.3g}', delay, f'{self.correlation:.2f}'
-        return names, self.what, *numbers, self.sentence()
 
 
 HEAD = ('compared', 'by', 'scale', 'delay (s)', 'correlation', 'this means')
@@ -166,121 +163,85 @@ def unit(pair: Pair) -> str:
     factors = {'turns': {180 / np.pi: 'degrees'}, 'way': {1e3: 'millimeters', 1e2: 'centimeters'}}
     for factor, name in factors[pair.what].items():
         for source, scale in ((pair.b, abs(pair.scale)), (pair.a, 1 / max(abs(pair.scale), 1e-9))):
-            if 1 / UNIT < scale / factor < UNIT:
+            if 1 / EQUAL < scale / factor < EQUAL:
                 return f' ({source} in {name}?)'
     return ''
 
 
 def compare(a: Source, b: Source, what: str = 'turns') -> Pair | None:
-    """Compare two sources; None where they show too little motion at the same time."""
-    slow, fast = sorted((a, b), key=lambda one: -one.period_s)
-    if slow.sums(what) is None or fast.sums(what) is None:
+    """Compare two sources; None where they measured too little motion at the same time."""
+    slow, fast = sorted((a, b), key=lambda source: -source.period_s)
+    if what not in slow.sums or what not in fast.sums:
         return None
-    for length_s in _SHORTEST_S * 2.0 ** np.arange(5):
+    for length_s in _WINDOWS_S:
         windows = _windows(slow, fast, length_s)
-        fixed = _moved(slow, windows, what)
-        if _usual(fixed) >= _STEP or not len(windows) or 2 * length_s > _LONGEST_WINDOW_S:
+        if not len(windows):
+            return None
+        fixed = slow.moved(windows, what)
+        if _typical(fixed) >= _STEP:
             break
-    if not len(windows):
-        return None
-    # Where `b` is late, it tells later what `a` has told.
+    # Where `b` is late, it reports later what `a` has reported.
     delays = (_GRID if slow is a else -_GRID)[:, None, None]
-    moving = _moved(fast, windows + np.round(delays * 1e9).astype(np.int64), what)
+    moving = fast.moved(windows + np.round(delays * 1e9).astype(np.int64), what)
     fixed = np.broadcast_to(fixed, moving.shape)
     x, y = (fixed, moving) if slow is a else (moving, fixed)
-    period_s = max(one.period_s for one in (a, b) if one.name != IMAGES)
-    found = _fitted(what, a.name, b.name, x, y)
-    return found and replace(found, period_s=period_s)
+    return _regressed(what, a, b, x, y)
 
 
 def _windows(slow: Source, fast: Source, length_s: float) -> Stamps:
-    """Windows (M, 2) ns between stamps of the slow source, in no pause of either source whatever
-    the delay.
-    """
-    stamps, edges = slow.stamps_ns, [0]
-    following = np.searchsorted(stamps, stamps + round(length_s * 1e9))
-    while following[edges[-1]] < len(stamps):
-        edges.append(int(following[edges[-1]]))
-    chosen = np.stack([stamps[edges[:-1]], stamps[edges[1:]]], 1)
-    chosen = chosen[np.diff(chosen)[:, 0] < (length_s + _PAUSE_S) * 1e9]
-    reach = round(LONGEST_S * 1e9)
-    for one, margin in ((slow, 0), (fast, reach)):
-        chosen = chosen[_unbroken(one.stamps_ns, chosen + np.array([-margin, margin]))]
-    return np.asarray(chosen[:: len(chosen) // _WINDOWS + 1])
+    """Windows (M, 2) ns between stamps of the slow source; whatever the delay, neither pauses."""
+    edges = slow.stamps_ns[:: int(np.ceil(length_s / slow.period_s))]
+    windows = np.column_stack([edges[:-1], edges[1:]])
+    reach = round(CLOCK_RANGE_S * 1e9)
+    for source, margin in ((slow, 0), (fast, reach)):
+        pause_s = max(_PAUSE_S, 3 * source.period_s)
+        begin, end = windows[:, 0] - margin, windows[:, 1] + margin
+        windows = windows[without_pause(begin, end, source.stamps_ns, pause_s)]
+    return windows[:: len(windows) // _WINDOWS_MAX + 1]
 
 
-def _unbroken(stamps: Stamps, windows: Stamps) -> Mask:
-    """Mask (M,) of the windows (M, 2) inside the stamps, without a pause."""
-    steps = np.diff(stamps)
-    pauses = np.flatnonzero(steps > max(_PAUSE_S * 1e9, 3 * np.median(steps)))
-    begun = np.searchsorted(stamps[pauses], windows[:, 1])
-    ended = np.searchsorted(stamps[pauses + 1], windows[:, 0], 'right')
-    inside = (windows[:, 0] >= stamps[0]) & (windows[:, 1] <= stamps[-1])
-    return np.asarray(inside & (begun == ended))
+def _typical(x: Array) -> float:
+    """Half of the motion is in steps as large, or larger ones: standing does not count."""
+    return quantile(np.abs(x), 0.5, np.abs(x))
 
 
-def _moved(source: Source, windows: Stamps, what: str) -> Array:
-    """The motion in windows (..., 2) ns."""
-    start = source.stamps_ns[0]
-    sums = source.sums(what)
-    assert sums is not None
-    at = np.interp((windows - start) * 1e-9, (source.stamps_ns - start) * 1e-9, sums)
-    return np.asarray(np.diff(at)[..., 0])
-
-
-def _usual(x: Array) -> float:
-    """The step in which half of the motion is done, or larger ones: standing does not matter."""
-    return quantile(np.abs(x), 0.5, np.abs(x)) if len(x) else 0.0
-
-
-def _fitted(what: str, a: str, b: str, x: Array, y: Array) -> Pair | None:
-    """The best of the delays: x (D, M) against y (D, M)."""
+def _regressed(what: str, a: Source, b: Source, x: Array, y: Array) -> Pair | None:
+    """The best of D delays, of the motion x (D, M) of `a` and y (D, M) of `b` in M windows."""
     middle = len(_GRID) // 2
-    # Noise adds up where nothing moves, and that of images may be large.
-    steps = [np.abs(s[middle]) for s, name in ((x, a), (y, b)) if name != IMAGES]
+    # Noise adds up while nothing moves, and that of images may be large.
+    steps = [np.abs(s[middle]) for s, source in ((x, a), (y, b)) if source.name != IMAGES]
     if max(s[s > _STEP / 2].sum() for s in steps) < ENOUGH[what]:
         return None
-    limit = np.array([_usual(x[middle]), _usual(y[middle])])
-    # Shifts of images may be wrong by any angle.
-    limit = np.minimum(limit, 2 * limit[::-1]) if IMAGES in (a, b) else limit
+    limit = np.array([_typical(x[middle]), _typical(y[middle])])
+    # Shifts between images may err by any angle.
+    limit = np.minimum(limit, 2 * limit[::-1]) if IMAGES in (a.name, b.name) else limit
     u, v = (np.clip(s, -_OUTLIER * q, _OUTLIER * q) for s, q in zip((x, y), limit, strict=True))
-    kept = np.ones(x.shape[1], bool)
+    inlier = np.ones(x.shape[1], bool)
     for _ in range(2):
-        alike = _cosines(u[:, kept], v[:, kept])
-        best = int(np.argmax(alike - 1e-6 * np.abs(_GRID)))
-        scale = _slope(x[best, kept], y[best, kept])
-        # What is far beside the line says nothing of it.
-        beside, moves = np.abs(y[best] - scale * x[best]), np.abs(u[best]) > limit[0] / 4
-        usual = MEDIAN_TO_STD * float(np.median(beside[moves])) if moves.any() else np.inf
-        kept = beside <= max(_OUTLIER * usual, limit[1] / 2)
-    # As much as chance moves a correlation of so many windows with motion.
-    chance = (1 - alike[best] ** 2) / np.sqrt(max(moves.sum(), 1))
-    as_good = _GRID[alike >= alike[best] - chance - 1e-3]
-    inside = 0 < best < len(_GRID) - 1
-    known = inside and np.ptp(as_good) / 4 < _STD_MAX_S
-    part = float(parabola_peak(*alike[best - 1 : best + 2])) if inside else 0.0
-    delay_s = float(_GRID[best]) + part * (_GRID[1] - _GRID[0])
-    return Pair(what, a, b, scale, delay_s, bool(known), float(alike[best]), 0.0)
-
-
-def _cosines(u: Array, v: Array) -> Array:
-    """Correlations (D,), without their sign, of rows (D, M) whose mean is no offset."""
-    power = np.sqrt((u * u).sum(1) * (v * v).sum(1))
-    found = np.divide(np.abs((u * v).sum(1)), power, out=np.zeros(len(u)), where=power > 0)
-    return np.asarray(found)
-
-
-def _slope(x: Array, y: Array) -> float:
-    """k of the least sum of |y - k x|: the median of y / x, weighted by |x|."""
-    moved = x != 0
-    return quantile(y[moved] / x[moved], 0.5, np.abs(x[moved])) if moved.any() else 0.0
+        power = (u[:, inlier] ** 2).sum(1) * (v[:, inlier] ** 2).sum(1)
+        correlation = np.abs((u * v)[:, inlier].sum(1)) / np.sqrt(np.maximum(power, 1e-30))
+        best = int(np.argmax(correlation - 1e-6 * np.abs(_GRID)))
+        # The least sum of |y - scale x|.
+        ratio = y[best] / np.where(x[best] == 0, 1.0, x[best])
+        scale = quantile(ratio[inlier], 0.5, np.abs(x[best, inlier]))
+        residual, moves = np.abs(y[best] - scale * x[best]), np.abs(u[best]) > limit[0] / 4
+        std = MEDIAN_TO_STD * float(np.median(residual[moves])) if moves.any() else np.inf
+        inlier = residual <= max(_OUTLIER * std, limit[1] / 2)
+    # Delays whose correlation is within one standard deviation of the best.
+    chance = (1 - correlation[best] ** 2) / np.sqrt(max(moves.sum(), 1))
+    as_good = _GRID[correlation >= correlation[best] - chance - 1e-3]
+    delay_s = None
+    if 0 < best < len(_GRID) - 1 and np.ptp(as_good) / 4 < _STD_MAX_S:
+        peak = float(parabola_peak(*correlation[best - 1 : best + 2]))
+        delay_s = float(_GRID[best] + peak * (_GRID[1] - _GRID[0]))
+    period_s = max(source.period_s for source in (a, b) if source.name != IMAGES)
+    return Pair(what, a.name, b.name, scale, delay_s, float(correlation[best]), period_s)
 
 
 def compare_map(odometry: Odometry, stamps_ns: Stamps, poses: Array) -> Pair | None:
-    """The way of the images (M,) of a drive, by the map, with that of the odometry.
+    """The way of the images (M,) of a drive by the map, compared with that of the odometry.
 
-    `poses` (M, 3) are their places in the map, m, by the images alone, and their yaw, rad. None for
-    a drive that is too short.
+    `poses` (M, 3) are x m, y m and yaw rad by the images alone. None for too short a drive.
     """
     driven = odometry.trajectory.at(stamps_ns)
     part = odometry.part[np.searchsorted(odometry.stamps_ns[1:-1], stamps_ns, 'right')]
@@ -290,10 +251,12 @@ def compare_map(odometry: Odometry, stamps_ns: Stamps, poses: Array) -> Pair | N
     first = first[part[first] == part[last[first]]]
     if way[-1] < ENOUGH['way'] or not len(first):
         return None
+    # Displacements (K,) in the frame of the robot at their start.
     x, y = (
-        np.diff(places[np.stack([first, last[first]])], axis=0)[0] * np.exp(-1j * yaw[first])
-        for places, yaw in ((one[:, 0] + 1j * one[:, 1], one[:, 2]) for one in (driven, poses))
+        (path[last[first], 0] - path[first, 0] + 1j * (path[last[first], 1] - path[first, 1]))
+        * np.exp(-1j * path[first, 2])
+        for path in (driven, poses)
     )
-    together, power = np.vdot(x, y), float(np.vdot(x, x).real)
-    alike = float(np.abs(together) / np.sqrt(max(power * np.vdot(y, y).real, 1e-12)))
-    return Pair('way', POSE, MAP, float(together.real) / max(power, 1e-12), 0.0, False, alike, 0.0)
+    product, power = np.vdot(x, y), max(float(np.vdot(x, x).real), 1e-12)
+    correlation = float(np.abs(product) / np.sqrt(max(power * np.vdot(y, y).real, 1e-12)))
+    return Pair('way', POSE, MAP, float(product.real) / power, None, correlation)
