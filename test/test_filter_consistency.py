@@ -86,7 +86,7 @@ class Robot:
 
     def _driven(self, rng, dt):
         way, turn = np.abs(self.true[:, 0]) * dt, np.abs(self.true[:, 1]) * dt
-        slip = SHIPPED.slip_per_metre * np.sqrt(way)
+        slip = SHIPPED.slip_per_meter * np.sqrt(way)
         yaw = np.sqrt(YAW_PER_METER**2 * way + SHIPPED.yaw_per_radian**2 * turn)
         steps = arc(*self.true.T, dt)
         poses = [np.array([*rng.uniform(-5, 5, 2), rng.uniform(-3, 3)])]

@@ -128,7 +128,7 @@ class Ekf:
     ) -> None:
         self._config, self._correlation, self._rig = config, correlation, rig or Rig()
         self._noise = MotionNoise(
-            config.slip_per_metre, config.yaw_per_radian, correlation.distance_m
+            config.slip_per_meter, config.yaw_per_radian, correlation.distance_m
         )
         self._kalman = kalman or Kalman()
         self._alike = correlation.share >= ALIKE_SHARE
