@@ -42,7 +42,7 @@ from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.fusion.motion import State
 from sfa_localization.fusion.odometry import COAST_S
 from sfa_localization.fusion.pose_filter import PoseFilter
-from sfa_localization.fusion.replay import Track
+from sfa_localization.fusion.replay import FilterTrack
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
@@ -88,7 +88,7 @@ class _Drive:
 
     run: Run
     truth: Trajectory
-    tracks: dict[str, Track]
+    tracks: dict[str, FilterTrack]
     features: Array
     sure: NDArray[np.bool_]
     counts: dict[str, Any]
@@ -207,12 +207,12 @@ def _driven(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> 
     counts['nis'] = None if math.isnan(localizer.filter.nis) else localizer.filter.nis
     if clock.delay_ns:
         counts['camera_delay_s'] = round(clock.delay_s, 3)
-    if OpenLoop.of(run.odometry.twists).found:  # the robot is late, not the images
+    if OpenLoop.of(run.odometry.twists).repeats:  # the robot is late, not the images
         clock = CameraClock()
     located = [(state, level) for level, state in zip(levels, states, strict=True) if state]
-    tracks = {'sfa': _images(usable, clock), 'ekf': Track.of([state for state, _ in located])}
+    tracks = {'sfa': _images(usable, clock), 'ekf': FilterTrack.of([state for state, _ in located])}
     if isinstance(localizer.filter, Smoother):
-        tracks['smoothed'] = Track.of(localizer.filter.smoothed())
+        tracks['smoothed'] = FilterTrack.of(localizer.filter.smoothed())
     sure = np.array([level is Level.LOCALISED for _, level in located], bool)
     assert run.ground_truth is not None
     features = np.array([one.slow_features for one in usable])
@@ -242,14 +242,14 @@ def _lasted_s(stamps_ns: Stamps) -> Array:
     return np.minimum(np.diff(stamps_ns, prepend=stamps_ns[:1]) * 1e-9, COAST_S)
 
 
-def _images(usable: list[Observation], clock: CameraClock) -> Track:
+def _images(usable: list[Observation], clock: CameraClock) -> FilterTrack:
     """The usable images in the map.
 
     The map is judged where images were taken, by `clock`; the filter has to find out by itself.
     """
     stamps = np.array([one.stamp_ns for one in usable], np.int64) - clock.delay_ns
     poses = np.array([[*one.position, one.yaw] for one in usable])
-    return Track(Trajectory(stamps, poses), np.array([one.covariance for one in usable]))
+    return FilterTrack(Trajectory(stamps, poses), np.array([one.covariance for one in usable]))
 
 
 def known(truth: Trajectory, stamps_ns: Stamps) -> Any:

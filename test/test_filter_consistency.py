@@ -148,7 +148,7 @@ SEEDS = 20
 
 
 def test_limits_are_quantiles_of_squared_distances():
-    for limits, share in ((ekf.GATE, 0.999), (ekf.OUTLYING, 0.8), (ekf.MEDIAN, 0.5)):
+    for limits, share in ((ekf.GATE, 0.999), (ekf.OUTLYING, 0.8)):
         assert limits == pytest.approx({size: chi2.ppf(share, size) for size in (2, 3)})
 
 

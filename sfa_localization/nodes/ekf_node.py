@@ -19,9 +19,8 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from sfa_localization.data.errors import MessageError
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.settings import Settings
-from sfa_localization.fusion.motion import wrap
 from sfa_localization.fusion.pose_filter import Level, PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import uncertainty
@@ -254,7 +253,7 @@ class EkfNode(LocalizationNode):
         """Publish map -> odom at a stamp of odometry; on /tf also for transform_tolerance after."""
         frames, stamp_ns = (self._config.map_frame, self._frames[0]), state.stamp_ns
         (x, y, yaw), (odom_x, odom_y, odom_yaw) = state.mean[:3].tolist(), odom
-        turn = wrap(yaw - odom_yaw)
+        turn = float(wrap_angle(yaw - odom_yaw))
         c, s = math.cos(turn), math.sin(turn)
         map_to_odom = x - c * odom_x + s * odom_y, y - s * odom_x - c * odom_y, turn
         self.tell(self._transform, convert.to_transform, map_to_odom, stamp_ns, frames)
@@ -354,6 +353,6 @@ class EkfNode(LocalizationNode):
             values['wheel scale'] = f'{state.wheel_scale:.4f}'
             values['way lost in turns [m/rad]'] = f'{state.turn_loss:.3f}'
         clock = self.filter.camera_clock
-        if clock.known:
+        if clock.is_estimated:
             values['camera delay [s]'] = f'{clock.delay_s:.3f}'
         return _LEVELS[status.level], '; '.join(status.reasons) or status.level.name, values
