@@ -41,7 +41,7 @@ from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.fusion.odometry import COAST_S
 from sfa_localization.fusion.pose_filter import PoseFilter, State
-from sfa_localization.fusion.replay import Track, replay
+from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
@@ -87,7 +87,7 @@ class _Localized:
 
     run: Run
     truth: Trajectory
-    tracks: dict[str, Track]
+    tracks: dict[str, FilterTrack]
     features: Array
     localised: Mask
     counts: dict[str, Any]
@@ -196,11 +196,11 @@ def _localized(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) 
         raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
     clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
     counts = _counts(run, observations, levels, fused, clock)
-    if OpenLoop.of(run.odometry.twists).found:  # the robot is late, not the images
+    if OpenLoop.of(run.odometry.twists).repeats:  # the robot is late, not the images
         clock = CameraClock()
-    tracks = {'sfa': _track(usable, clock), 'ekf': Track.of(states)}
+    tracks = {'sfa': _track(usable, clock), 'ekf': FilterTrack.of(states)}
     if isinstance(fused, Smoother):
-        tracks['smoothed'] = Track.of(fused.smoothed())
+        tracks['smoothed'] = FilterTrack.of(fused.smoothed())
     features = np.array([observation.slow_features for observation in usable])
     return _Localized(run, run.ground_truth, tracks, features, np.array(localised, bool), counts)
 
@@ -236,11 +236,11 @@ def _seconds_since_last(stamps_ns: Stamps) -> Array:
     return np.minimum(np.diff(stamps_ns, prepend=stamps_ns[:1]) * 1e-9, COAST_S)
 
 
-def _track(usable: Sequence[Observation], clock: CameraClock) -> Track:
+def _track(usable: Sequence[Observation], clock: CameraClock) -> FilterTrack:
     """The poses of single images, at the times when they were taken by `clock`."""
     stamps = np.array([image.stamp_ns for image in usable], np.int64) - clock.delay_ns
     poses = np.array([[*image.position, image.yaw] for image in usable])
-    return Track(Trajectory(stamps, poses), np.array([image.covariance for image in usable]))
+    return FilterTrack(Trajectory(stamps, poses), np.array([image.covariance for image in usable]))
 
 
 def has_truth(truth: Trajectory, stamps_ns: Stamps) -> Mask:

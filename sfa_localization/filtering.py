@@ -23,7 +23,7 @@ from sfa_localization.data.rejections import short_line
 from sfa_localization.data.run import Odometry, Stamps
 from sfa_localization.fusion.inputs import POSITION_STD
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
-from sfa_localization.fusion.replay import Track, replay
+from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
 
 SECOND_NS = 1_000_000_000
@@ -140,7 +140,7 @@ def run_filter(
             moved_ns = stamp_ns
         if stamp_ns == moved_ns and (state := fused.at(stamp_ns)):
             states[stamp_ns] = state
-    track = Track.of([*states.values()])
+    track = FilterTrack.of([*states.values()])
     return Filtered(
         track.poses.stamps_ns - shift,
         track.poses.poses,

@@ -169,4 +169,4 @@ def drive_of(run: Run) -> Drive:
             '%s: the stamps of images and odometry are %.2f s apart: the filter compensates half '
             'a second only; synchronize both clocks', run.name, abs(clock.delay_s),
         )  # fmt: skip
-    return Drive(run, turns, clock.delay_ns if clock.known else None)
+    return Drive(run, turns, clock.delay_ns if clock.is_estimated else None)

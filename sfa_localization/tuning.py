@@ -35,7 +35,7 @@ from sfa_localization.training import Recipe
 
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """The grid: factors on the variances of images and of odometry."""
-TUNED = ('measurement_factor', 'odometry_factor', 'slip_per_metre', 'yaw_per_radian')
+TUNED = ('measurement_factor', 'odometry_factor', 'slip_per_meter', 'yaw_per_radian')
 """What the likelihood decides, each on a logarithmic scale."""
 MIN_IMAGES = 20
 """With fewer images, chance decides between the settings."""

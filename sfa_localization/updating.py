@@ -30,7 +30,7 @@ from sfa_localization.data.run import Panoramas, Run
 from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
 from sfa_localization.fusion.camera_clock import camera_clock
-from sfa_localization.fusion.replay import Track, replay
+from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
@@ -164,11 +164,11 @@ def explained_quantile(model: PlaceModel) -> float:
 
 def _smoothed(smoother: Smoother, model: PlaceModel, run: Run) -> tuple[Array, NDArray[np.bool_]]:
     """Smoothed poses (N, 3) of the images, and a mask (N,) of those that are certain."""
-    smoothed = Track.of(smoother.smoothed())
+    smoothed = FilterTrack.of(smoother.smoothed())
     track, covariances = smoothed.poses, smoothed.covariances
     stamps = run.panoramas.stamps_ns
     clock = camera_clock(run.odometry, stamps, headings(run.panoramas))
-    delay_ns = clock.delay_ns if clock.known else round(model.rig.camera_delay.value * 1e9)
+    delay_ns = clock.delay_ns if clock.is_estimated else round(model.rig.camera_delay.value * 1e9)
     taken = stamps - delay_ns
     position_std = np.sqrt(np.linalg.eigvalsh(covariances[:, :2, :2])[:, 1])
     certain = (position_std <= CERTAIN_M) & (covariances[:, 2, 2] <= CERTAIN_RAD**2)

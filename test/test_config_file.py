@@ -66,7 +66,7 @@ def test_parameters_of_ros_are_kept(tmp_path):
 ekf_node:
   ros__parameters:
     lost_std: 3
-    slip_per_metre: 1e-3
+    slip_per_meter: 1e-3
     qos_overrides: {/odom: {subscription: {depth: 3}}}
 omnicam_node: {ros__parameters: {qos_overrides./panorama.publisher.depth: 7}}
 training: {ros__parameters: {slow_features: 7}}
@@ -74,7 +74,7 @@ training: {ros__parameters: {slow_features: 7}}
     )
     assert load_settings(path, 'omnicam_node', PanoramaConfig) == PanoramaConfig(width=300)
     found = load_settings(path, 'ekf_node', FilterConfig)
-    assert found == FilterConfig(lost_std=3.0, slip_per_metre=1e-3), 'whole numbers, no points'
+    assert found == FilterConfig(lost_std=3.0, slip_per_meter=1e-3), 'whole numbers, no points'
     changes = config_file.load_changes(path)
     write_config(tmp_path / 'new.yaml', changes)
     sections = yaml.safe_load((tmp_path / 'new.yaml').read_text())
@@ -85,7 +85,7 @@ training: {ros__parameters: {slow_features: 7}}
     assert ekf['use_sim_time'] is omnicam['use_sim_time'] is sfa['use_sim_time'] is True
     assert ekf['qos_overrides'] == {'/odom': {'subscription': {'depth': 3}}}
     assert omnicam['qos_overrides./panorama.publisher.depth'] == 7
-    assert (ekf['slip_per_metre'], type(ekf['lost_std'])) == (1e-3, float), 'as ROS reads them'
+    assert (ekf['slip_per_meter'], type(ekf['lost_std'])) == (1e-3, float), 'as ROS reads them'
     assert (omnicam['width'], training['slow_features']) == (300, 7)
     assert config_file.load_changes(tmp_path / 'new.yaml')['ekf_node'].items() >= ekf.items()
 

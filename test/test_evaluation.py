@@ -19,10 +19,10 @@ from sfa_localization.data.geometry import rotation
 from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion import pose_filter
 from sfa_localization.fusion.health import health_of
-from sfa_localization.fusion.track import Track
+from sfa_localization.fusion.track import DrivenPath
 from sfa_localization.place_model import PlaceModel
 
-TRUSTED = Track(since_m=-math.inf)
+TRUSTED = DrivenPath(since_m=-math.inf)
 
 
 @pytest.fixture(scope='module')

@@ -13,7 +13,7 @@ from filter_drives import stamps, winding
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import integrate
 from sfa_localization.fusion.health import LIKELY, health_of
-from sfa_localization.fusion.track import Image, Track, remembered
+from sfa_localization.fusion.track import DrivenPath, PositionFix, remembered
 
 RATE_HZ, EVERY, STD_M, STD_RAD = 20, 10, 0.1, 0.03
 MAP = 30 - 10j, 2.0
@@ -51,7 +51,7 @@ def drive(
     at_ns = stamps(len(twists), RATE_HZ).tolist()
     poses = integrate(np.array(at_ns), twists, np.zeros(3))
     shown, rng, way_m = shown or shows(), np.random.default_rng(seed), 0.0
-    track, images = Track(since_m=0.0), ()
+    track, images = DrivenPath(since_m=0.0), ()
     for i, (x, y, yaw) in enumerate(poses.tolist()):
         at = frame[0] + cmath.exp(1j * frame[1]) * complex(x, y)
         reckoned = at.real, at.imag, float(wrap_angle(yaw + frame[1]))
@@ -62,7 +62,7 @@ def drive(
             place += std_m * complex(*rng.standard_normal(2))
             look = float(wrap_angle(found[1] + mapped[1] + STD_RAD * rng.standard_normal()))
             look, variance = (look, STD_RAD**2) if heading else (math.nan, math.inf)
-            image = Image(at_ns[i], place, look, std_m**2, variance, reckoned, way_m)
+            image = PositionFix(at_ns[i], place, look, std_m**2, variance, reckoned, way_m)
             images = remembered(images, image)
     return track, images
 
@@ -129,14 +129,16 @@ def test_who_is_placed_anew_is_confirmed_by_driving_and_twice_as_long_each_time(
 def still(step_m=0.0, step_ns=1, yaw=0.0):
     """Nine images right beside each other, on a path of one knot."""
     images = (
-        Image(1 + i * step_ns, complex(i * step_m), yaw, 0.01, 1e-3, (i * step_m, 0.0, 0.0), 0.0)
+        PositionFix(
+            1 + i * step_ns, complex(i * step_m), yaw, 0.01, 1e-3, (i * step_m, 0.0, 0.0), 0.0
+        )
         for i in range(9)
     )
-    return Track(((1, 0.0, 0.0, 0.0),)), tuple(images)
+    return DrivenPath(((1, 0.0, 0.0, 0.0),)), tuple(images)
 
 
 ODD = {
-    'nothing': (Track(), ()),
+    'nothing': (DrivenPath(), ()),
     **{f'{n} images': drive(n / 2, heading=False) for n in range(1, 7)},
     'one place': still(),
     'one place, no heading': still(yaw=math.nan),

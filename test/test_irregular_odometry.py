@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from filter_drives import SECOND, START_NS, FilterDrive, known
 
+from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
@@ -57,18 +58,6 @@ def test_odometry_with_poses_may_be_stamped_irregularly(stamped):
     assert max(errors) < 0.1
 
 
-def test_images_stamped_with_the_odometry_after_a_stall_belong_where_they_came():
-    """A delay of 20 ms would put an image before all that came together, 0.4 m away."""
-    drive, fused = FilterDrive(seconds=20, omega_std=0.01, v_std=0.02, every=7), PoseFilter()
-    fused.expect_delay(0.02)
-    for i, t in enumerate(stalled(np.arange(1000) / 50.0).tolist()):
-        stamp_ns, pose = START_NS + round(t * 1e9), drive.poses[i]
-        fused.add_odometry(stamp_ns, *drive.read[i], drive.variances(), drive.reckoned[i])
-        if i in drive.pictures:
-            assert fused.add_measurement(stamp_ns + 50_000, pose, SURE).accepted
-            assert math.hypot(*(fused.state.pose - pose)[:2]) < 0.1
-
-
 def test_a_speed_that_no_twist_says_is_not_that_of_a_stall():
     """Of odometry that fills its poses only, bundled ones show how far it was, not how fast."""
     drive, fused = FilterDrive(seconds=10), known()
@@ -98,13 +87,13 @@ def test_equal_twists_of_a_robot_that_moves_are_commands(twists, repeats):
     odometry = OpenLoop()
     for v, omega in twists.tolist():
         odometry.add(v, omega)
-    assert odometry.found is repeats
+    assert odometry.repeats is repeats
 
 
 @pytest.mark.parametrize(('noise', 'delay_s'), [(0.0, DELAY_S), (1e-3, 0.0)])
 def test_the_estimate_is_where_commands_led_a_camera_delay_ago(noise, delay_s):
     drive, fused = FilterDrive(twists=held(noise)), known(std=0.01)
-    fused.expect_delay(DELAY_S)
+    fused.expect(Rig(camera_delay=Quantity(DELAY_S, 0.2)))
     for stamp_ns, (v, omega) in zip(drive.stamps_ns.tolist(), drive.twists.tolist(), strict=True):
         fused.add_odometry(stamp_ns, v, omega)
     for i in (450, 520, 599):

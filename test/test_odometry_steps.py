@@ -9,6 +9,7 @@ import pytest
 from filter_drives import SECOND, START_NS, FilterDrive, from_rest, known, winding
 
 from sfa_localization.data.odometry_steps import beyond, tolerance
+from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
 
 SURE = np.diag([0.0025, 0.0025, 0.0004])
@@ -144,7 +145,7 @@ def test_a_delay_other_than_expected_is_estimated_from_the_first_turn(late_s):
     """No visual turns are given: the images' poses show it, against the motion by the wheels."""
     drive = FilterDrive(seconds=20, rate_hz=50)
     fused, late_ns, errors = PoseFilter(), round(late_s * SECOND), []
-    fused.expect_delay(0.0)
+    fused.expect(Rig(camera_delay=Quantity(0.0, 0.2)))
     arrives = lambda event: event[0] + event[1] * late_ns  # noqa: E731
     for stamp_ns, kind, index in sorted(drive.events(), key=arrives):
         drive.give(fused, (stamp_ns + kind * late_ns, kind, index), heading=True)

@@ -219,18 +219,15 @@ def test_pip_installs_one_command_and_the_nodes_and_colcon_every_command_for_ros
         assert executables(command) == executables('bdist_wheel') | commands
 
 
-SLOW_TO_IMPORT = {'filterpy', 'mdp', 'matplotlib', 'scipy.optimize', 'scipy.stats'}
-
-
 @pytest.mark.parametrize(
     ('module', 'unwanted'),
     [
-        ('fusion.pose_filter', {'cv2', 'scipy', *SLOW_TO_IMPORT}),
-        ('camera.panorama', {'scipy', *SLOW_TO_IMPORT}),
-        ('localizer', {'scipy', *SLOW_TO_IMPORT}),
+        ('fusion.pose_filter', {'cv2', 'mdp', 'rosbags'}),
+        ('camera.panorama', {'scipy', 'filterpy', 'mdp', 'matplotlib'}),
+        ('localizer', {'mdp', 'trimesh', 'rosbags', f'{NAME}.training'}),
     ],
 )
-def test_what_nodes_import_is_there_at_once(module, unwanted):
+def test_nodes_import_neither_training_nor_what_only_it_needs(module, unwanted):
     command = [sys.executable, '-c', f'import sys, {NAME}.{module}\nprint(*sys.modules)']
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert unwanted & set(done.stdout.split()) == set() and NAME in done.stdout

@@ -58,5 +58,5 @@ def test_a_node_explains_itself_without_ros(name):
     )
     assert done.returncode == 0, done.stderr
     assert f'usage: {name} ' in done.stdout and 'autostart: true' in done.stdout
-    other = 'least_explained:' if name != 'sfa_node' else 'slip_per_metre:'
+    other = 'least_explained:' if name != 'sfa_node' else 'slip_per_meter:'
     assert other not in done.stdout, 'parameters of another node'

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from sfa_localization.fusion.relocation import relocate
-from sfa_localization.fusion.track import CAPACITY, SPACING_M, Image, remembered
+from sfa_localization.fusion.track import CAPACITY, SPACING_M, PositionFix, remembered
 
 STD_M, STD_RAD = 0.1, 0.05
 
@@ -22,7 +22,7 @@ def along(count, step_m=0.2, heading=True, wrong=(), noise=0.0, turn=1.2, seed=0
         place = way_m * np.exp(1j * turn) + (5 - 3j) + noise * complex(*rng.standard_normal(2))
         place += complex(*rng.uniform(3, 9, 2)) if k in wrong else 0
         yaw, variance = (turn, STD_RAD**2) if heading else (math.nan, math.inf)
-        images.append(Image(k, place, yaw, STD_M**2, variance, (way_m, 0.0, 0.0), way_m))
+        images.append(PositionFix(k, place, yaw, STD_M**2, variance, (way_m, 0.0, 0.0), way_m))
     return images
 
 

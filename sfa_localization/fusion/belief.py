@@ -10,9 +10,8 @@ import numpy as np
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.rig import Quantity
-from sfa_localization.fusion.inputs import symmetric
 from sfa_localization.fusion.motion import State, Twist
-from sfa_localization.fusion.track import Image, Pose, Track
+from sfa_localization.fusion.track import DrivenPath, Pose, PositionFix
 
 ENOUGH_IMAGES = 5
 """Images in a row that overrule an established estimate: half a second to a second of a camera."""
@@ -21,7 +20,7 @@ DOUBT_STDS = 2.0
 
 
 class OdometryEvent(NamedTuple):
-    """An odometry reading at its stamp; `pose` is the message's own, in the odometry frame."""
+    """An odometry reading at its stamp; `pose` is the message's, in the odometry frame."""
 
     stamp_ns: int
     twist: Twist
@@ -37,15 +36,16 @@ class Jump(NamedTuple):
 
 
 class Odometer(NamedTuple):
-    """What is remembered of the odometry: the stamp and pose of its last message, the stamps at
-    which position and heading were last renewed (0 where never), whether its twist is filled, and
-    the standard deviation `noise` (m, rad) of its steps. A `suspect` is a message after an
-    impossible step, which the next one confirms, or not; `jump` is the last one confirmed.
+    """Stamp and pose of the odometry's last message, the stamp at which the pose last changed (0:
+    never), whether the twist is filled, and the standard deviation `noise` (m, rad) of the steps.
+
+    A `suspect` is a message after an impossible step, which waits until the next one confirms it;
+    `jump` is the last step that was confirmed.
     """
 
     stamp_ns: int | None = None
     pose: Pose | None = None
-    renewed_ns: tuple[int, int] = (0, 0)
+    renewed_ns: int = 0
     fills_twist: bool = True
     noise: float = 0.01
     suspect: OdometryEvent | None = None
@@ -61,24 +61,20 @@ class PoseEvent(NamedTuple):
 
 
 class MeasurementEvent(NamedTuple):
-    """A position (2,) or pose (3,) from an image, with its covariance.
+    """A position (2,) or pose (3,) from an image, with its positive definite covariance.
 
-    It is fused `late`, s, earlier than expected of its stamp: what turns of the images show, with
-    an infinite standard deviation where they show nothing. `jacobian` (2 or 3, 12) and `white`, the
-    part of the noise that is this image's own, follow from the covariance: see
-    ekf.measurement_event.
+    `late` is the delay of the camera by the turns of the images, s, beyond the expected one; its
+    standard deviation is infinite before any turn.
     """
 
     stamp_ns: int
     value: Array
     covariance: Array
-    jacobian: Array
-    white: Array
     late: Quantity
 
 
 class DelayEvent(NamedTuple):
-    """An image `late` by more than is compensated, s: where it shows the robot is left out."""
+    """An image that is left out because it is `late` by more than can be compensated, s."""
 
     stamp_ns: int
     late: Quantity
@@ -90,8 +86,8 @@ Event = OdometryEvent | PoseEvent | MeasurementEvent | DelayEvent
 class Update(NamedTuple):
     """What became of one measurement.
 
-    `d2` is the squared Mahalanobis distance of the full innovation, with `threshold` its gate;
-    both NaN where there was nothing to compare with. `innovation` (2,) or (3,) with its covariance.
+    `d2` is the squared Mahalanobis distance of the full innovation, `threshold` its gate; both are
+    NaN where there was nothing to compare with. `innovation` (2,) or (3,) with its covariance.
     """
 
     stamp_ns: int
@@ -104,29 +100,19 @@ class Update(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """The record of measurements since the last start.
-
-    `support` counts accepted images, `rejected` those outside the gate in a row. `accepted_ns` is
-    the stamp of the last accepted image; `images` are the latest. `scatter`, the usual squared
-    distance of images over that expected, and `period_s`, the usual time between images, outlive
-    restarts.
+    """The record of measurements since the last start: `support` counts accepted images, `rejected`
+    those outside the gate in a row; `accepted_ns` is the stamp of the last accepted image.
     """
 
     support: int = 0
     rejected: int = 0
     accepted_ns: int | None = None
-    images: tuple[Image, ...] = ()
+    images: tuple[PositionFix, ...] = ()
     update: Update | None = None
-    scatter: float = 1.0
-    period_s: float = 1.0
 
 
 class Belief(NamedTuple):
-    """Everything that the next event changes. `located` is False before the first pose.
-
-    `omega` rad/s is the mean turn rate, as odometry shows it, over the time before its last
-    message. `track` is the path beside images.
-    """
+    """Everything that the next event changes. `located` is False before the first pose."""
 
     stamp_ns: int
     mean: Array
@@ -137,18 +123,23 @@ class Belief(NamedTuple):
     twist: Twist
     odometry: Odometer
     memory: Memory
-    track: Track = Track()
-    omega: float = 0.0
+    path: DrivenPath = DrivenPath()
 
     @property
     def state(self) -> State | None:
-        """The estimate, if there is any. While images in a row were rejected, it is as uncertain as
-        the last differs from it; the gate is not: wrong images must not open it.
+        """The estimate, if there is any. While images in a row are rejected, its variance includes
+        the last innovation; that of the gate does not, so that wrong images cannot open it.
         """
         if not self.located:
             return None
         covariance, update = symmetric(self.covariance), self.memory.update
         if self.memory.rejected >= ENOUGH_IMAGES and update and update.innovation is not None:
-            x, y, *yaw = (update.innovation / DOUBT_STDS).tolist()
-            covariance[:3, :3] += np.diag([x * x + y * y] * 2 + [sum(turn**2 for turn in yaw)])
+            squares = np.square(update.innovation / DOUBT_STDS)
+            covariance[[0, 1], [0, 1]] += squares[:2].sum()
+            covariance[2, 2] += squares[2:].sum()
         return State(self.stamp_ns, self.mean, covariance)
+
+
+def symmetric(matrix: Array) -> Array:
+    """The symmetric part."""
+    return (matrix + matrix.T) / 2

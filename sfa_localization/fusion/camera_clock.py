@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""By how much the camera's stamps are late, from turns that images and odometry both show.
+"""By how much the camera's stamps are late, from the turns that images and odometry both measure.
 
-The time by which the turns between images lag behind those of the odometry is what the two clocks,
-or exposure and transfer, differ by. No map is needed: it works from the first turns on.
+The delay is the lag of the turns between images behind those of the odometry. No map is needed: it
+works from the first turns on.
 """
 
 from __future__ import annotations
@@ -19,15 +19,33 @@ from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, Stamps
 
 NEAR_NS = 150_000_000
-"""Headings of images nearer in time are left out: they show turns that are too small."""
+"""Headings of images nearer in time are left out: the turns between them are too small."""
+SIGNIFICANT_STDS = 2.5
+"""Standard deviations that a delay must exceed before it is compensated."""
+_STEP_S = 0.02
+_GRID = np.arange(-round(CLOCK_RANGE_S / _STEP_S), round(CLOCK_RANGE_S / _STEP_S) + 1) * _STEP_S
+# Pairs of images farther apart in time, or with a pause of the odometry between, are left out.
+_PAIR_NS, _PAUSE_NS = 1_000_000_000, 500_000_000
+# An estimate applies to images stamped so much later, so that it does not depend on which message
+# came first.
+_IN_TRANSIT_NS, _REMEMBERED_NS = 1_000_000_000, 10_000_000_000
+_WINDOW_NS = round(CLOCK_RANGE_S * 1e9) + 100_000_000
+# Residuals beyond _OUTLIER of _SCALE_RAD are mismatches of images and count no more; sums of them
+# within _ALIKE do not tell delays apart.
+_SCALE_RAD, _OUTLIER, _ALIKE = 0.05, 4.0, 1.0
+# Smaller turns, rad, and fewer do not show how well images and odometry agree.
+_TURN_RAD, _TURNS_MIN = 0.05, 10
+# Neighboring pairs err alike: on a slow curve, things near the camera look like turns for seconds.
+_CAUTION, _SCALE_MIN_RAD, _STD_MAX_S = 4.0, 1e-3, 0.06
+_MEAN_OF_NORMAL = 0.798  # of |x|: sqrt(2 / pi)
 
 
 @dataclass(frozen=True, slots=True)
 class CameraClock:
-    """`delay_s` by which images are stamped later than odometry, known to `std_s`.
+    """`delay_s` by which images are stamped later than odometry, with its standard deviation.
 
-    0 and infinity where the drive does not show it: it takes turns that begin and end. An `assumed`
-    delay is used even where it is smaller than its standard deviation.
+    0 and infinity before turns that begin and end show it. An `assumed` delay is used even where it
+    is smaller than its standard deviation.
     """
 
     delay_s: float = 0.0
@@ -35,7 +53,7 @@ class CameraClock:
     assumed: bool = False
 
     @property
-    def known(self) -> bool:
+    def is_estimated(self) -> bool:
         """Whether the delay is assumed, or the drive shows it at all."""
         return self.assumed or bool(np.isfinite(self.std_s))
 
@@ -45,93 +63,67 @@ class CameraClock:
         significant = self.assumed or abs(self.delay_s) > SIGNIFICANT_STDS * self.std_s
         return round(self.delay_s * 1e9) if significant else 0
 
-    def unless(self, found: CameraClock) -> CameraClock:
-        """This delay, where it is assumed and another one that was found agrees; else that."""
-        if not self.assumed or abs(found.delay_s - self.delay_s) > SIGNIFICANT_STDS * found.std_s:
-            return found
-        return CameraClock(self.delay_s, min(self.std_s, found.std_s), True)
-
-
-SIGNIFICANT_STDS, _MEAN_OF_NORMAL = 2.5, 0.798  # of |x|: sqrt(2 / pi)
-_STEP_S = 0.02
-_GRID = np.arange(-round(CLOCK_RANGE_S / _STEP_S), round(CLOCK_RANGE_S / _STEP_S) + 1) * _STEP_S
-# Images farther apart in time, or with a pause of the odometry between, are not compared. An
-# estimate is for images stamped so much later, so that those in transit do not depend on which
-# message came first.
-_APART_NS, _PAUSE_NS = 1_000_000_000, 500_000_000
-_IN_TRANSIT_NS, _REMEMBERED_NS = 1_000_000_000, 10_000_000_000
-_WINDOW_NS = round(CLOCK_RANGE_S * 1e9) + 100_000_000
-# Differences beyond a few of these, rad, are mismatches of images and count no more; sums that
-# differ by one of them show no difference between delays.
-_SCALE_RAD, _OUTLIER, _ALIKE = 0.05, 4.0, 1.0
-# Smaller turns, rad, and fewer do not show how well images and odometry agree.
-_TURN_RAD, _TURNS_MIN = 0.05, 10
-# Neighboring pairs err alike: on a slow curve, things near the camera look like turns for seconds.
-_CAUTION, _SCALE_MIN_RAD, _STD_MAX_S = 4.0, 1e-3, 0.06
-
 
 class CameraClockFinder:
     """Compares the turns between images with those of the odometry, as both come in.
 
     `memory` is the number of image pairs after which an old one counts little; clocks drift.
-    `start` is the estimate until another is found.
+    `start` is the estimate before any other.
     """
 
     def __init__(self, memory: float = np.inf, start: CameraClock | None = None) -> None:
         self._keep = 1.0 - 1.0 / memory
         self._start = start or CameraClock()
-        self._found: deque[tuple[int, CameraClock]] = deque([(0, self._start)])
-        self._stamps: deque[int] = deque()
-        self._yaws: deque[float] = deque()
+        self._estimates: deque[tuple[int, CameraClock]] = deque([(0, self._start)])
+        self._driven: deque[tuple[int, float]] = deque()
         self._pauses: deque[int] = deque()
         self._last: tuple[int, float] | None = None
         self._pairs: deque[tuple[int, int, float]] = deque()
         # By the sign of the columns and the delay: cost, its curvature, and of the pairs with
-        # turns their number, their size and their differences.
-        self._cost, self._power, self._turns, self._size, self._left = np.zeros((5, 2, len(_GRID)))
+        # turns their number, their size and their residuals.
+        self._cost, self._power, self._turns, self._size, self._error = np.zeros((5, 2, len(_GRID)))
 
     def expect(self, clock: CameraClock) -> None:
-        """Use this estimate until another is found."""
+        """Use this estimate before any other."""
         self._start = clock
-        self._found[0] = 0, clock
+        self._estimates[0] = 0, clock
 
     @property
     def clock(self) -> CameraClock:
         """The newest estimate."""
-        return self._found[-1][1]
+        return self._estimates[-1][1]
 
     def clock_at(self, stamp_ns: int) -> CameraClock:
         """The estimate that applies to an image of this stamp."""
-        for found_ns, clock in reversed(self._found):
-            if found_ns + _IN_TRANSIT_NS <= stamp_ns:
+        for since_ns, clock in reversed(self._estimates):
+            if since_ns + _IN_TRANSIT_NS <= stamp_ns:
                 return clock
-        return self._found[0][1]
+        return self._estimates[0][1]
 
-    def add_odometry(self, stamp_ns: int, omega: float) -> None:
-        """Take a turn rate rad/s, held since the message before; late stamps are skipped."""
-        if self._stamps:
-            gap = stamp_ns - self._stamps[-1]
-            if gap <= 0:
+    def add_odometry(self, stamp_ns: int, yaw_rad: float) -> None:
+        """Take the heading by dead reckoning at a stamp; late stamps are skipped."""
+        if self._driven:
+            last_ns, last_yaw = self._driven[-1]
+            if stamp_ns <= last_ns:
                 return
-            if gap > _PAUSE_NS:
+            if stamp_ns - last_ns > _PAUSE_NS:
                 self._pauses.append(stamp_ns)
-        yaw = self._yaws[-1] + omega * gap * 1e-9 if self._yaws else 0.0
-        self._stamps.append(stamp_ns)
-        self._yaws.append(yaw)
+            yaw_rad = last_yaw + float(wrap_angle(yaw_rad - last_yaw))
+        self._driven.append((stamp_ns, yaw_rad))
         while self._pairs and self._pairs[0][1] + _WINDOW_NS <= stamp_ns:
             self._compare(*self._pairs.popleft())
-        oldest = (self._pairs[0][0] if self._pairs else stamp_ns - _APART_NS) - _WINDOW_NS
-        while len(self._stamps) > 2 and self._stamps[1] < oldest - _WINDOW_NS:
-            self._stamps.popleft()
-            self._yaws.popleft()
+        oldest = (self._pairs[0][0] if self._pairs else stamp_ns - _PAIR_NS) - 2 * _WINDOW_NS
+        while len(self._driven) > 2 and self._driven[1][0] < oldest:
+            self._driven.popleft()
 
     def add_heading(self, stamp_ns: int, yaw_rad: float) -> None:
         """Take the heading that a `VisualGyro` has added up at an image's stamp."""
-        if self._last is not None and 0 <= stamp_ns - self._last[0] < NEAR_NS:
-            return
-        if self._last is not None and 0 < stamp_ns - self._last[0] < _APART_NS:
-            turn = float(wrap_angle(yaw_rad - self._last[1]))
-            self._pairs.append((self._last[0], stamp_ns, turn))
+        if self._last is not None:
+            span_ns, turn = stamp_ns - self._last[0], float(wrap_angle(yaw_rad - self._last[1]))
+            if 0 <= span_ns < NEAR_NS:
+                return
+            if 0 < span_ns < _PAIR_NS:
+                self._pairs.append((self._last[0], stamp_ns, turn))
         self._last = stamp_ns, yaw_rad
 
     def _compare(self, start_ns: int, stop_ns: int, turn: float) -> None:
@@ -139,40 +131,41 @@ class CameraClockFinder:
         first, last = start_ns - _WINDOW_NS, stop_ns + _WINDOW_NS
         while self._pauses and self._pauses[0] < first:
             self._pauses.popleft()
-        if first < self._stamps[0] or (self._pauses and self._pauses[0] <= last):
+        if first < self._driven[0][0] or (self._pauses and self._pauses[0] <= last):
             return
-        at = (np.array(self._stamps, np.int64) - start_ns) * 1e-9
-        yaw = np.array(self._yaws)
-        span = (stop_ns - start_ns) * 1e-9
-        driven = np.interp(span - _GRID, at, yaw) - np.interp(-_GRID, at, yaw)
-        left = np.abs(wrap_angle(np.array([[turn], [-turn]]) - driven)) / _SCALE_RAD
-        fits, turning = left < _OUTLIER, np.abs(driven) > _TURN_RAD
+        stamps_ns, yaw = zip(*self._driven, strict=True)
+        seconds, span = (np.array(stamps_ns) - start_ns) * 1e-9, (stop_ns - start_ns) * 1e-9
+        driven = np.interp(span - _GRID, seconds, yaw) - np.interp(-_GRID, seconds, yaw)
+        residual = np.abs(wrap_angle(np.array([[turn], [-turn]]) - driven)) / _SCALE_RAD
+        limited, turning = np.minimum(residual, _OUTLIER), np.abs(driven) > _TURN_RAD
         for total, new in (
-            (self._cost, np.minimum(left, _OUTLIER)),
+            (self._cost, limited),
             # A moment more of delay changes the turn by the change of the turn rate.
-            (self._power, fits * np.gradient(driven, _STEP_S) ** 2),
+            (self._power, (residual < _OUTLIER) * np.gradient(driven, _STEP_S) ** 2),
             (self._turns, turning),
             (self._size, turning * np.abs(driven)),
-            (self._left, turning * np.minimum(left, _OUTLIER) * _SCALE_RAD),
+            (self._error, turning * limited * _SCALE_RAD),
         ):
             total *= self._keep
             total += new
-        found = self._estimate()
-        if found.known:
-            self._found.append((last, self._start.unless(found)))
-        while len(self._found) > 2 and self._found[1][0] < last - _REMEMBERED_NS:
-            self._found.popleft()
+        estimate, start = self._estimate(), self._start
+        if estimate.is_estimated:
+            agrees = abs(estimate.delay_s - start.delay_s) <= SIGNIFICANT_STDS * estimate.std_s
+            if start.assumed and agrees:
+                estimate = CameraClock(start.delay_s, min(start.std_s, estimate.std_s), True)
+            self._estimates.append((last, estimate))
+        while len(self._estimates) > 2 and self._estimates[1][0] < last - _REMEMBERED_NS:
+            self._estimates.popleft()
 
     def _estimate(self) -> CameraClock:
         """The delay of the least cost, unless it lies at the border or the turns do not fix it."""
         side, best = np.unravel_index(int(np.argmin(self._cost)), self._cost.shape)
-        turns, size, left = (a[side, best] for a in (self._turns, self._size, self._left))
+        turns, size, error = (a[side, best] for a in (self._turns, self._size, self._error))
         # Columns may grow clockwise or counterclockwise: the better sign is the right one.
-        if turns < _TURNS_MIN or left > size / 2 or not 0 < best < len(_GRID) - 1:
+        if turns < _TURNS_MIN or error > size / 2 or not 0 < best < len(_GRID) - 1:
             return CameraClock()
-        scale = max(left / turns / _MEAN_OF_NORMAL, _SCALE_MIN_RAD)
-        power = float(self._power[side, best])
-        std = _CAUTION * scale / np.sqrt(power) if power > 0 else np.inf
+        scale = max(error / turns / _MEAN_OF_NORMAL, _SCALE_MIN_RAD)
+        std = _CAUTION * scale / np.sqrt(max(self._power[side, best], 1e-12))
         # While a robot turns steadily, many delays fit nearly as well as the best.
         alike = _GRID[self._cost[side] <= self._cost[side, best] + _ALIKE]
         std = max(std, float(np.ptp(alike)) / 4)
@@ -192,12 +185,9 @@ def camera_clock(odometry: Odometry, stamps_ns: Stamps, headings: Iterable[float
     either, because the one that agrees better with the odometry is taken.
     """
     finder, image_headings = CameraClockFinder(), iter(headings)
-    # The poses' own turn rates: also where messages hold no twist.
-    seconds = np.maximum(np.diff(odometry.stamps_ns) * 1e-9, 1e-9)
-    rates = [0.0, *(np.diff(np.unwrap(odometry.poses[:, 2])) / seconds).tolist()]
     for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, stamps_ns):
         if kind == ODOMETRY:
-            finder.add_odometry(stamp_ns, rates[i])
+            finder.add_odometry(stamp_ns, float(odometry.poses[i, 2]))
         else:
             finder.add_heading(stamp_ns, next(image_headings))
     return finder.clock

@@ -3,8 +3,8 @@
 """A bounded, sorted history of events, replayed from where a late one belongs.
 
 Beliefs are a pure function of the sorted events: an event that comes late has exactly the effect
-that it would have had in time. What follows it is redone when it is asked for: events that lie
-ahead of all that come would be redone by each of them.
+that it would have had in time. The beliefs after it are made anew when they are asked for, so that
+events far ahead are not replayed for each one that comes.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _SLACK = 64  # events added between two clean-ups, which cost a copy of the list
 class History(Generic[E, B]):
     """Events by (stamp_ns, rank), each with the belief after it; `step` makes the next belief.
 
-    `start` is the belief at `start_ns`, before which no event can be placed. Events that are
-    older than `span_ns` are forgotten, or moved to the `archive`, in order, where there is one.
+    `start` is the belief at `start_ns`, before which no event can be placed. Events older than
+    `span_ns` can no longer be placed, and are forgotten unless all are to be kept (`keep`).
     """
 
     def __init__(
@@ -32,16 +32,13 @@ class History(Generic[E, B]):
         start: B,
         step: Callable[[B, E], B],
         start_ns: int | None = None,
-        archive: list[E] | None = None,
+        keep: bool = False,
     ) -> None:
-        self._span_ns = span_ns
-        self._archive = archive
-        self._step = step
-        self._base = start
-        self._horizon_ns = start_ns
+        self._span_ns, self._step, self._keep = span_ns, step, keep
+        self._base, self._horizon_ns = start, start_ns
         self._until_forgetting = _SLACK
         self._keys: list[Key] = []
-        self._events: list[E] = []
+        self.events: list[E] = []
         self._beliefs: list[B] = []
 
     def __len__(self) -> int:
@@ -55,15 +52,10 @@ class History(Generic[E, B]):
     def newest_ns(self) -> int | None:
         return self._keys[-1][0] if self._keys else self._horizon_ns
 
-    @property
-    def events(self) -> list[E]:
-        """All events in order, as far as they are not forgotten."""
-        return [*(self._archive or ()), *self._events]
-
     def holds(self, key: Key) -> bool:
         """Whether there is an event of this stamp and rank."""
         at = bisect_left(self._keys, key)
-        return at < len(self._keys) and self._keys[at] == key
+        return self._keys[at : at + 1] == [key]
 
     def reaches(self, stamp_ns: int) -> bool:
         """Whether an event of this stamp can still be placed."""
@@ -74,16 +66,12 @@ class History(Generic[E, B]):
     def add(self, key: Key, event: E) -> B:
         """Place an event, in place of one of the same key. Returns the belief right after it."""
         at = bisect_left(self._keys, key)
-        if at == len(self._keys):
-            self._until_forgetting -= 1
-        if at < len(self._keys) and self._keys[at] == key:
-            self._events[at] = event
-        else:
-            self._keys.insert(at, key)
-            self._events.insert(at, event)
+        replaced = at + self.holds(key)
+        self._keys[at:replaced], self.events[at:replaced] = [key], [event]
         del self._beliefs[at:]
         belief = self._belief(at + 1)
-        if self._until_forgetting <= 0:
+        self._until_forgetting -= 1
+        if self._until_forgetting <= 0 and not self._keep:
             self._forget()
         return belief
 
@@ -94,19 +82,15 @@ class History(Generic[E, B]):
     def _belief(self, count: int) -> B:
         """The belief after the first events, as many as `count`; those before it are made too."""
         belief = self._beliefs[-1] if self._beliefs else self._base
-        for event in self._events[len(self._beliefs) : count]:
+        for event in self.events[len(self._beliefs) : count]:
             belief = self._step(belief, event)
             self._beliefs.append(belief)
         return self._beliefs[count - 1] if count else self._base
 
     def _forget(self) -> None:
-        """Drop what lies beyond the span, now and then; its last belief is the new base."""
+        """Drop what lies beyond the span; its last belief is the new base."""
         self._until_forgetting = _SLACK
         cut = bisect_left(self._keys, (self._keys[-1][0] - self._span_ns, 0))
-        if cut == 0:
-            return
-        self._base = self._belief(cut)
-        self._horizon_ns = self._keys[cut - 1][0]
-        if self._archive is not None:
-            self._archive += self._events[:cut]
-        del self._keys[:cut], self._events[:cut], self._beliefs[:cut]
+        if cut:
+            self._base, self._horizon_ns = self._belief(cut), self._keys[cut - 1][0]
+            del self._keys[:cut], self.events[:cut], self._beliefs[:cut]

@@ -2,28 +2,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motion of the filter's state: constant turn rate and velocity (CTRV), driven by odometry.
 
-Section 5 of the paper names the model (CTRV, its reference [17]) and prints no equation of it, so
-the formulas stand here. With h = omega dt / 2 and the chord c = v dt sin(h) / h, a motion at
-constant v and omega leads from (x, y, yaw) to (`arc`)
+Section 5 of the paper names the model (its reference [17]) and prints no equation. With
+h = omega dt / 2 and the chord c = v dt sin(h) / h, constant v and omega lead from (x, y, yaw) to
 
     x' = x + c cos(yaw + h)    y' = y + c sin(yaw + h)    yaw' = yaw + omega dt
 
-and its derivatives fill the Jacobian (`_advance`). The state has nine components more than a pose:
+The state has nine components more than a pose:
 
-- V, OMEGA: speed m/s and turn rate rad/s of the robot, as in CTRV. Odometry replaces them:
+- V, OMEGA: speed m/s and turn rate rad/s of the robot. Odometry replaces them:
   v = (1 + scale) v_odometry - loss |omega_odometry|, omega = omega_odometry - bias (`drive`).
 - BIAS: what the odometry's turn rate reads too much, rad/s; a random walk in time.
-- SCALE: true speed over wheel speed, minus 1; a random walk over the distance. Both calibrate the
-  odometry while driving (augmented Kalman filter: Larsen et al., ICRA 1998).
-- LOSS: way that is lost in a turn, m per radian; a random walk over the angle. Wheels of real
-  robots push less where they turn, and controllers slow down: four small ones lost 0.07 to 0.1.
+- SCALE: true speed over wheel speed, minus 1; a random walk over the distance (augmented Kalman
+  filter: Larsen et al., ICRA 1998).
+- LOSS: way that wheels lose in a turn, m per radian; a random walk over the angle. Four small
+  robots lost 0.07 to 0.1.
 - DELAY: by how much images are stamped later than expected, s; a random walk in time. An image
-  shows the robot of so long ago (`velocity`), which turns tell from an error of the pose.
-- ERROR (3): the error that images of one place share, in standard deviations of the measurement.
-  Images of neighboring places err alike, because the map is wrong there: e' = f e + sqrt(1 - f^2) n
-  with f = exp(-distance / decorrelation) and n white of unit variance (Gauss-Markov process as
-  added state: Gelb, Applied Optimal Estimation, 1974). So a robot that stands still learns from
-  its thousandth image no more than from the first.
+  shows the robot as it was that long ago; turns distinguish this from an error of the pose.
+- ERROR (3): the error that images of one place share, in standard deviations of the measurement:
+  e' = f e + sqrt(1 - f^2) n with f = exp(-distance / decorrelation) and white n of unit variance
+  (Gauss-Markov process: Gelb, Applied Optimal Estimation, 1974). A robot that stands still thus
+  learns no more from its thousandth image than from its first.
 """
 
 from __future__ import annotations
@@ -33,20 +31,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfa_localization.data.geometry import SPOT_RADIUS_M, Array
+from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, wrap_angle
 
 X, Y, YAW, V, OMEGA, BIAS, SCALE, LOSS, DELAY, ERROR = range(10)
 SIZE = 12
 TURN_RADIUS_M = 0.25
 """Distance that one radian of turning counts as: about half the track of a small robot."""
 YAW_PER_METER = 0.005
-"""Heading error that grows with the distance, rad per sqrt(m): turns the wheels do not show."""
+"""Heading error that grows with the distance, rad per sqrt(m): turns that wheels do not show."""
 ODOMETRY_CORRELATION_S = 0.1
 """Time for which odometry readings err alike: about the time constant of a wheel controller."""
 BIAS_WALK, SCALE_WALK, LOSS_WALK, DELAY_WALK = 1e-4, 1e-3, 1e-3, 1e-3
-"""Random walks: of the turn-rate bias, rad/s per sqrt(s), that of a cheap warm gyroscope; of the
-wheel scale, 1/sqrt(m), a percent over 100 m, as load and ground change; of the way lost in turns,
-m/rad per sqrt(rad); of the camera's delay, s per sqrt(s): clocks 50 ppm apart in 1000 s."""
+"""Random walks: turn-rate bias of a cheap gyroscope, rad/s per sqrt(s); wheel scale, 1/sqrt(m), a
+percent over 100 m; loss in turns, m/rad per sqrt(rad); delay of the camera, s per sqrt(s)."""
 ACCELERATION = 1.0
 """Change of speed (m/s) and turn rate (rad/s) per sqrt(s) without new odometry."""
 UNKNOWN_SPEED, UNKNOWN_RATE = 0.5, 0.5
@@ -54,11 +51,9 @@ UNKNOWN_SPEED, UNKNOWN_RATE = 0.5, 0.5
 STANDSTILL_SPEED, STANDSTILL_RATE = 1e-3, 2e-3
 """A robot slower (m/s) and turning slower (rad/s) than this stands: encoders and gyros flicker."""
 BIAS_STD = 0.01
-"""Standard deviation of the turn-rate bias, rad/s, before any is learned: data sheets of cheap
-gyroscopes. What is known of wheels and of the camera's clock is a matter of `Rig`."""
-_HELD_VARIANCE = 1e-8  # of v and omega at a standstill: positive, to keep the covariance so
+"""Standard deviation of the turn-rate bias before any is learned, rad/s: cheap gyroscopes."""
+_HELD_VARIANCE = 1e-8  # of v and omega at a standstill: keeps the covariance positive
 _STRAIGHT_RAD = 1e-4  # half turns below this are summed as series, exact to rounding
-_DIAGONAL = slice(0, None, SIZE + 1)  # of flat matrices
 
 
 class State(NamedTuple):
@@ -81,12 +76,12 @@ class State(NamedTuple):
     @property
     def twist(self) -> Array:
         """Speed m/s and turn rate rad/s, corrected by scale and bias (2,)."""
-        return self.mean[V : OMEGA + 1].copy()
+        return self.mean[V:BIAS].copy()
 
     @property
     def twist_covariance(self) -> Array:
         """Covariance (2, 2) of `twist`."""
-        return self.covariance[V : OMEGA + 1, V : OMEGA + 1].copy()
+        return self.covariance[V:BIAS, V:BIAS].copy()
 
     @property
     def yaw_rate_bias(self) -> float:
@@ -106,17 +101,11 @@ class State(NamedTuple):
     @property
     def position_std(self) -> float:
         """Standard deviation along the worst direction, m."""
-        return largest_std(self.covariance)
+        return math.sqrt(max(float(np.linalg.eigvalsh(self.covariance[:2, :2])[1]), 0.0))
 
     @property
     def yaw_std(self) -> float:
         return math.sqrt(max(float(self.covariance[YAW, YAW]), 0.0))
-
-
-def largest_std(covariance: Array) -> float:
-    """Standard deviation along the worst direction of x and y, the first rows of a covariance."""
-    a, b, c = covariance[0, 0], covariance[1, 1], covariance[0, 1]
-    return math.sqrt(max(float((a + b) / 2 + math.hypot((a - b) / 2, c)), 0.0))
 
 
 class Step(NamedTuple):
@@ -146,21 +135,14 @@ class Twist(NamedTuple):
     v_variance: float
     omega_variance: float
 
-
-class Arc(NamedTuple):
-    """A motion over dt at constant v and omega, and its derivatives."""
-
-    dx: float
-    dy: float
-    dyaw: float
-    dx_dv: float
-    dy_dv: float
-    dx_domega: float
-    dy_domega: float
+    @property
+    def moves(self) -> bool:
+        """Whether a robot of this twist does not stand."""
+        return abs(self.v) >= STANDSTILL_SPEED or abs(self.omega) >= STANDSTILL_RATE
 
 
-def arc(yaw: float, v: float, omega: float, dt: float) -> Arc:
-    """The motion of the module's formulas; with s = sin(h) / h its derivatives are
+def arc(yaw: float, v: float, omega: float, dt: float) -> tuple[Array, Array]:
+    """The motion (3,) over dt, and its derivatives (3, 2) by v and omega; with s = sin(h) / h
 
     dx/dv = dt s cos(yaw + h)
     dx/domega = (dt / 2) (v dt ds/dh cos(yaw + h) - c sin(yaw + h)),    ds/dh = (cos(h) - s) / h
@@ -173,17 +155,13 @@ def arc(yaw: float, v: float, omega: float, dt: float) -> Arc:
     else:
         sinc = math.sin(half) / half
         slope = (math.cos(half) - sinc) / half
-    c, s = math.cos(yaw + half), math.sin(yaw + half)
-    reach, bend, chord = dt * sinc, v * dt * slope * dt / 2, v * dt * sinc
-    return Arc(
-        dx=chord * c,
-        dy=chord * s,
-        dyaw=omega * dt,
-        dx_dv=reach * c,
-        dy_dv=reach * s,
-        dx_domega=bend * c - chord * s * dt / 2,
-        dy_domega=bend * s + chord * c * dt / 2,
-    )
+    ahead = np.array([math.cos(yaw + half), math.sin(yaw + half)])
+    across = np.array([-ahead[1], ahead[0]])
+    by_twist = np.zeros((3, 2))
+    by_twist[:2, 0] = dt * sinc * ahead
+    by_twist[:2, 1] = v * dt * dt / 2 * (slope * ahead + sinc * across)
+    by_twist[2, 1] = dt
+    return np.array([*(v * dt * sinc * ahead), omega * dt]), by_twist
 
 
 def drive(
@@ -192,24 +170,22 @@ def drive(
     """Move by odometry: `twist`, held over the last `dt` seconds. It becomes the state's v and
     omega, or the twist of `now` does.
 
-    v' = (1 + scale) v_odometry - loss |omega_odometry| (with the sign of v; none on the spot) and
-    omega' = omega_odometry - bias: the columns of the old v and omega in the Jacobian vanish; those
-    of scale, loss and bias are v_odometry, -|omega_odometry| and -1 times those of v' and omega'.
-    Each reading adds noise of its own variance through the same columns.
+    The columns of the old v and omega in the Jacobian vanish; those of bias, scale and loss follow
+    by the chain rule from v' and omega'. Each reading adds noise of its variance in the same way.
     """
-    if abs(twist.v) < STANDSTILL_SPEED and abs(twist.omega) < STANDSTILL_RATE:
+    if not twist.moves:
         return _stand(mean)
     v, omega, by_loss = _corrected(mean, twist)
     step = _advance(mean, v, omega, twist, dt, noise)
-    moved, twists = slice(X, OMEGA + 1), slice(V, OMEGA + 1)
-    gain = step.jacobian[moved, twists].copy()
-    step.jacobian[moved, twists] = 0.0
-    step.jacobian[moved, BIAS:DELAY] = gain.dot(((0.0, twist.v, by_loss), (-1.0, 0.0, 0.0)))
-    step.noise[moved, moved] += (gain * twist[2:]).dot(gain.T)
-    if now is not None and now is not twist:
-        step.mean[V], step.mean[OMEGA], slowed = _corrected(mean, now)
+    by_twist = step.jacobian[:BIAS, V:BIAS].copy()
+    step.jacobian[:BIAS, V:BIAS] = 0.0
+    step.jacobian[:BIAS, BIAS:DELAY] = by_twist @ [[0.0, twist.v, by_loss], [-1.0, 0.0, 0.0]]
+    variances = np.diag([twist.v_variance, twist.omega_variance])
+    step.noise[:BIAS, :BIAS] += by_twist @ variances @ by_twist.T
+    if now is not None:
+        step.mean[V], step.mean[OMEGA], by_loss_now = _corrected(mean, now)
         step.jacobian[V, SCALE] += now.v - twist.v
-        step.jacobian[V, LOSS] += slowed - by_loss
+        step.jacobian[V, LOSS] += by_loss_now - by_loss
     return step
 
 
@@ -224,26 +200,26 @@ def _corrected(mean: Array, twist: Twist) -> tuple[float, float, float]:
 
 
 def coast(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
-    """Move on without new odometry: v and omega stay, and become less certain (CTRV); what a random
-    walk of theirs moves the pose by has a third of its variance, and half in common with it.
+    """Move on without new odometry: v and omega stay, and become less certain (CTRV). The pose
+    gets a third of the variance of their random walk, and half of it in common with them.
 
     `twist` is the last reading, whose noise still counts.
     """
     v, omega = float(mean[V]), float(mean[OMEGA])
     standing = v == 0.0 and omega == 0.0
     step = _stand(mean) if standing else _advance(mean, v, omega, twist, dt, noise)
-    twists, gain, walk = slice(V, OMEGA + 1), step.jacobian[:3, V : OMEGA + 1], ACCELERATION**2 * dt
-    step.noise[:3, :3] += walk / 3 * gain.dot(gain.T)
-    step.noise[:3, twists] += walk / 2 * gain
-    step.noise[twists, :3] += walk / 2 * gain.T
-    step.noise[[V, OMEGA], [V, OMEGA]] += walk
+    by_twist, walk = step.jacobian[:3, V:BIAS], ACCELERATION**2 * dt
+    step.noise[:3, :3] += walk / 3 * by_twist @ by_twist.T
+    step.noise[:3, V:BIAS] += walk / 2 * by_twist
+    step.noise[V:BIAS, :3] += walk / 2 * by_twist.T
+    step.noise[V:BIAS, V:BIAS] += walk * np.eye(2)
     return step
 
 
 def halt(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
-    """Odometry has been silent for too long: expect no motion, and allow for any.
+    """Expect no motion, and allow for any: odometry has been silent for too long.
 
-    What a robot may have done since is bounded by UNKNOWN_SPEED or its last reading, `twist`.
+    UNKNOWN_SPEED, or the last reading `twist`, bounds what a robot may have done since.
     """
     step, speed = _stand(mean), max(UNKNOWN_SPEED, abs(twist.v))
     step.noise[[X, Y, V], [X, Y, V]] += speed**2 * np.array([2 * dt, 2 * dt, 1.0])
@@ -253,59 +229,40 @@ def halt(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
 
 def _stand(mean: Array) -> Step:
     """The wheels stand: nothing moves, and nothing becomes less certain."""
-    after = mean.copy()
-    after[V] = after[OMEGA] = 0.0
-    jacobian = np.eye(SIZE)
-    jacobian[V, V] = jacobian[OMEGA, OMEGA] = 0.0
-    noise = np.zeros((SIZE, SIZE))
-    noise[V, V] = noise[OMEGA, OMEGA] = _HELD_VARIANCE
+    after, jacobian, noise = mean.copy(), np.eye(SIZE), np.zeros((SIZE, SIZE))
+    after[V:BIAS] = 0.0
+    jacobian[V:BIAS, V:BIAS] = 0.0
+    noise[V:BIAS, V:BIAS] = _HELD_VARIANCE * np.eye(2)
     return Step(after, jacobian, noise)
 
 
 def _advance(
     mean: Array, v: float, omega: float, twist: Twist, dt: float, noise: MotionNoise
 ) -> Step:
-    """CTRV at v and omega over dt: mean, full Jacobian, and the noise that driving itself adds."""
-    x, y, yaw, _, _, bias, scale, loss, delay, *errors = mean.tolist()
-    way = arc(yaw, v, omega, dt)
-    fade = math.exp(-(abs(v) * dt + TURN_RADIUS_M * abs(omega) * dt) / noise.decorrelation_m)
-    after = np.array(
-        [x + way.dx, y + way.dy, wrap(yaw + way.dyaw), v, omega, bias, scale, loss, delay]
-        + [fade * error for error in errors]
-    )
-    jacobian = np.zeros((SIZE, SIZE))
-    jacobian.flat[_DIAGONAL] = (1, 1, 1, 1, 1, 1, 1, 1, 1, fade, fade, fade)
-    jacobian[X, YAW], jacobian[Y, YAW] = -way.dy, way.dx
-    jacobian[X, V], jacobian[Y, V] = way.dx_dv, way.dy_dv
-    jacobian[X, OMEGA], jacobian[Y, OMEGA] = way.dx_domega, way.dy_domega
-    jacobian[YAW, OMEGA] = dt
-    added = _drift(abs(v) * dt, abs(omega) * dt, dt, fade, noise)
-    if dt > 0:
-        # Readings err alike for a while. This does not average out with the rate of the messages:
-        # over dt it moves the pose as a constant error of variance (variance * time / dt) would.
-        gain, share = jacobian[:3, V : OMEGA + 1], ODOMETRY_CORRELATION_S / dt
-        added[:3, :3] += (gain * (twist[2] * share, twist[3] * share)).dot(gain.T)
-    return Step(after, jacobian, added)
-
-
-def _drift(meters: float, radians: float, dt: float, fade: float, noise: MotionNoise) -> Array:
-    """Slip in proportion to the distance, and the random walks of BIAS to ERROR, (12, 12)."""
-    slip, fresh = noise.slip_per_meter**2 * meters, 1 - fade * fade
+    """CTRV at v and omega over dt: mean, full Jacobian, and the noise of driving itself: slip, the
+    random walks of BIAS to ERROR, and errors of readings.
+    """
+    moved, by_twist = arc(float(mean[YAW]), v, omega, dt)
+    meters, radians = abs(v) * dt, abs(omega) * dt
+    fade = math.exp(-(meters + TURN_RADIUS_M * radians) / noise.decorrelation_m)
+    after = np.array([*(mean[:3] + moved), v, omega, *mean[BIAS:ERROR], *(fade * mean[ERROR:])])
+    after[YAW] = wrap_angle(after[YAW])
+    jacobian = np.diag([1.0] * ERROR + [fade] * 3)
+    jacobian[:2, YAW] = -moved[1], moved[0]
+    jacobian[:3, V:BIAS] = by_twist
+    slip = noise.slip_per_meter**2 * meters
     yaw = YAW_PER_METER**2 * meters + noise.yaw_per_radian**2 * radians
-    walks = (
-        BIAS_WALK**2 * dt, SCALE_WALK**2 * meters, LOSS_WALK**2 * radians, DELAY_WALK**2 * dt
-    )  # fmt: skip
-    covariance = np.zeros((SIZE, SIZE))
-    covariance.flat[_DIAGONAL] = (slip, slip, yaw, 0, 0, *walks, fresh, fresh, fresh)
-    return covariance
+    walks = np.square([BIAS_WALK, SCALE_WALK, LOSS_WALK, DELAY_WALK]) * [dt, meters, radians, dt]
+    added = np.diag([slip, slip, yaw, 0, 0, *walks, *[1 - fade * fade] * 3])
+    # Readings err alike for a while, which does not average out with the rate of the messages: over
+    # dt it moves the pose as a constant error of variance (variance * time / dt) would.
+    if dt > 0:
+        lasting = ODOMETRY_CORRELATION_S / dt * np.diag([twist.v_variance, twist.omega_variance])
+        added[:3, :3] += by_twist @ lasting @ by_twist.T
+    return Step(after, jacobian, added)
 
 
 def velocity(mean: Array) -> Array:
     """Of x m/s, y m/s and yaw rad/s (3,)."""
-    yaw, v, omega = mean[YAW : OMEGA + 1].tolist()
+    yaw, v, omega = mean[YAW:BIAS].tolist()
     return np.array([v * math.cos(yaw), v * math.sin(yaw), omega])
-
-
-def wrap(angle: float) -> float:
-    """Wrap to [-pi, pi): the scalar form of geometry.wrap_angle, which costs too much here."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,23 +20,23 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.messages import LARGEST_SCALE
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.belief import (
     Belief,
     DelayEvent,
     Event,
+    MeasurementEvent,
     OdometryEvent,
     PoseEvent,
     Update,
 )
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
-from sfa_localization.fusion.ekf import Ekf, measurement_event
+from sfa_localization.fusion.ekf import Ekf
 from sfa_localization.fusion.health import Health, health_of
 from sfa_localization.fusion.history import History
 from sfa_localization.fusion.inputs import OpenLoop, read_measurement, read_pose, read_twist
 from sfa_localization.fusion.motion import State
-from sfa_localization.fusion.odometry import COAST_S, ODOMETRY_TIMEOUT_S, stalled
+from sfa_localization.fusion.odometry import COAST_S, ODOMETRY_TIMEOUT_S
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level, Status, status_of
 from sfa_localization.fusion.timeline import (
@@ -48,7 +47,7 @@ from sfa_localization.fusion.timeline import (
     ClockWentBack,
     Timeline,
 )
-from sfa_localization.fusion.track import Pose, newest_new
+from sfa_localization.fusion.track import newest_new
 
 __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
 
@@ -60,7 +59,8 @@ class PoseFilter:
     """Fuses odometry with positions (2,) or poses (3,) in the map; see FilterConfig.
 
     `correlation` is how the errors of neighboring images correlate. `counts` holds what became of
-    all messages. No message raises; what is unusable is counted.
+    all messages, `scale` the factor on the way of odometry. No message raises; what is unusable is
+    counted.
     """
 
     def __init__(
@@ -69,8 +69,8 @@ class PoseFilter:
         self.config = config or FilterConfig()
         self.correlation = correlation or ErrorCorrelation()
         self.counts: Counter[str] = Counter()
+        self.scale = self.config.odometry_scale
         self._nis = 0.0, 0
-        self.scale, self._shift, self._counted = self.config.odometry_scale, (0.0, 0.0), (0.0, 0.0)
         self._camera, self._expected_s = CameraClockFinder(_CLOCK_MEMORY), 0.0
         self._rig = Rig()
         self._ekf = Ekf(self.config, self.correlation, self._rig)
@@ -127,9 +127,8 @@ class PoseFilter:
         if newest is None or self._waiting is not None:
             self._forget()
             self._waiting = value, checked
-        else:
-            near = abs(stamp_ns - newest) <= COAST_S * 1e9
-            stamp_ns = stamp_ns if near and self._history.reaches(stamp_ns) else newest
+        elif abs(stamp_ns - newest) > COAST_S * 1e9 or not self._history.reaches(stamp_ns):
+            stamp_ns = newest
         event = PoseEvent(int(stamp_ns), value, checked)
         self._history.add((event.stamp_ns, POSE), event)
 
@@ -144,25 +143,27 @@ class PoseFilter:
         """Take speed m/s and turn rate rad/s, held since the message before; '' or why not.
 
         `variances` (2,) of both; zero or less, or not finite, where unknown. `pose` (3,) is
-        odometry's own, x m, y m, yaw rad in any frame: where it agrees with the twist, the distance
-        is taken from it.
+        odometry's, x m, y m, yaw rad in any frame: where it agrees with the twist, the distance is
+        taken from it.
         """
         stamp_ns = int(stamp_ns)
         try:
-            commands = self._open_loop.found
+            commands = self._open_loop.repeats
             twist = read_twist(self.scale * v, omega, variances, self.config, commands)
-            again = partial(self.add_odometry, stamp_ns, v, omega, variances, pose)
-            self._timeline.require_order(stamp_ns, ODOMETRY, self._history, again)
+            self._timeline.require_order(stamp_ns, ODOMETRY, self._history)
             self._require_place(stamp_ns, ODOMETRY)
         except DataError as error:
             self.counts[f'odometry: {error}'] += 1
             return str(error)
         self.counts['odometry: used'] += 1
         self._open_loop.add(twist.v, twist.omega)
-        event = OdometryEvent(stamp_ns, twist, self._scaled(pose))
-        driven = self._history.add((stamp_ns, ODOMETRY), event)
+        scaled = None
+        if pose is not None and all(map(math.isfinite, pose)):
+            x, y, yaw = map(float, pose)
+            scaled = self.scale * x, self.scale * y, yaw
+        driven = self._history.add((stamp_ns, ODOMETRY), OdometryEvent(stamp_ns, twist, scaled))
         if driven.odometry.stamp_ns == stamp_ns:
-            self._camera.add_odometry(stamp_ns, driven.omega)
+            self._camera.add_odometry(stamp_ns, driven.dead_reckoned[2])
         return ''
 
     def add_measurement(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> Update:
@@ -174,25 +175,25 @@ class PoseFilter:
         stamp_ns = int(stamp_ns)
         try:
             fused, noise = read_measurement(value, covariance, self.config.measurement_factor)
-            again = partial(self.add_measurement, stamp_ns, value, covariance)
-            self._timeline.require_order(stamp_ns, MEASUREMENT, self._history, again)
-            taken_ns = self._taken(stamp_ns)
-            self._require_place(taken_ns, MEASUREMENT)
+            self._timeline.require_order(stamp_ns, MEASUREMENT, self._history)
             clock = self._camera.clock_at(stamp_ns)
+            # When the image was taken, on the clock of the odometry.
+            taken_ns = max(stamp_ns - clock.delay_ns, 1) if stamp_ns > 0 else stamp_ns
+            self._require_place(taken_ns, MEASUREMENT)
             late = Quantity(clock.delay_ns * 1e-9 - self._expected_s, clock.std_s)
             if abs(clock.delay_ns) > DELAY_LIMIT_NS:
                 self._history.add((taken_ns, MEASUREMENT), DelayEvent(taken_ns, late))
                 raise DataError('clocks of camera and odometry are more than 0.5 s apart')
-            event = measurement_event(taken_ns, fused, noise, self.correlation.share, late)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
+        event = MeasurementEvent(taken_ns, fused, noise, late)
         update = self._history.add((taken_ns, MEASUREMENT), event).memory.update
         assert update is not None
         self.counts[f'measurement: {update.reason}'] += 1
         if update.d2 <= update.threshold:
             self._nis = self._nis[0] + update.d2 / len(fused), self._nis[1] + 1
-        return update if taken_ns == stamp_ns else update._replace(stamp_ns=stamp_ns)
+        return update._replace(stamp_ns=stamp_ns)
 
     def add_turned(self, stamp_ns: int, yaw_rad: float) -> None:
         """Take how far images have turned, from any start, at an image's stamp; NaN is left out.
@@ -204,49 +205,21 @@ class PoseFilter:
             self._camera.add_heading(int(stamp_ns), yaw_rad)
 
     def expect(self, rig: Rig) -> None:
-        """Begin with what training learned of the robot; what was learned under way stays."""
+        """Begin with what training learned of the robot; what was learned under way stays. Turns
+        under way overrule the camera's delay.
+        """
         self._rig, self._ekf = rig, Ekf(self.config, self.correlation, rig)
-        self.expect_delay(rig.camera_delay.value)
-        self.expect_scale(rig.wheel_scale.value)
+        self.scale = rig.wheel_scale.value * self.config.odometry_scale
+        delay_s = rig.camera_delay.value
+        if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.is_estimated:
+            self._expected_s = delay_s
+            self._camera.expect(CameraClock(delay_s, assumed=True))
         belief, prior = self._history.newest, self._ekf.blank(0)
+        # The pose of odometry jumps to the new scale: forget the one before.
+        belief = belief._replace(odometry=belief.odometry._replace(pose=None))
         if not belief.located:
             belief = belief._replace(mean=prior.mean, covariance=prior.covariance)
         self._go_on(belief)
-
-    def expect_delay(self, delay_s: float) -> None:
-        """Begin with the camera's delay of the training drives; turns under way overrule it."""
-        if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
-            self._expected_s = delay_s
-            self._camera.expect(CameraClock(delay_s, assumed=True))
-
-    def expect_scale(self, scale: float) -> None:
-        """Multiply the way of all odometry from now on by the factor of a model, and by that of the
-        settings. The pose of odometry goes on from where it is.
-        """
-        if not 1 / LARGEST_SCALE <= scale <= LARGEST_SCALE:
-            return
-        scale *= self.config.odometry_scale
-        (x, y), (dx, dy), change = self._counted, self._shift, self.scale - scale
-        self.scale, self._shift = scale, (dx + change * x, dy + change * y)
-
-    def _scaled(self, pose: Sequence[float] | Array | None) -> Pose | None:
-        """The pose of odometry by the way that was driven; None where there is none."""
-        if pose is None or not all(map(math.isfinite, pose)):
-            return None
-        x, y, yaw = map(float, pose)
-        self._counted = x, y
-        return self.scale * x + self._shift[0], self.scale * y + self._shift[1], yaw
-
-    def _taken(self, stamp_ns: int) -> int:
-        """When an image was taken, on the clock of the odometry. Where that shows far more motion
-        in the delay than it takes, as after a network's stall, the order of the stamps says more.
-        """
-        delay_ns = self._camera.clock_at(stamp_ns).delay_ns if stamp_ns > 0 else 0
-        if delay_ns == 0:
-            return stamp_ns
-        taken_ns = max(stamp_ns - delay_ns, 1)
-        earlier, later = self._history.before(taken_ns), self._history.before(stamp_ns)
-        return stamp_ns if stalled(earlier, later, taken_ns, stamp_ns) else taken_ns
 
     def _require_place(self, stamp_ns: int, kind: int) -> None:
         """Raise DataError when a stamp cannot be used; start anew when the clock went back."""
@@ -301,20 +274,11 @@ class PoseFilter:
 
     def _at(self, stamp_ns: int) -> State | None:
         """A robot that is commanded is where its odometry was a delay ago, and its images right."""
-        robot_ns, delay_ns = stamp_ns, self._camera.clock.delay_ns if self._open_loop.found else 0
+        robot_ns, delay_ns = stamp_ns, self._camera.clock.delay_ns if self._open_loop.repeats else 0
         if 0 < abs(delay_ns) <= DELAY_LIMIT_NS and self._history.reaches(stamp_ns - delay_ns):
             robot_ns -= delay_ns
         state = self._ekf.coast(self._history.before(robot_ns), robot_ns).state
-        return state and self._widened(state)._replace(stamp_ns=stamp_ns)
-
-    def _widened(self, state: State) -> State:
-        """The estimate, less certain by what may be the matter."""
-        variances = self.health.variances
-        if not any(variances):
-            return state
-        covariance = state.covariance.copy()
-        covariance[:3, :3] += np.diag(variances)
-        return state._replace(covariance=covariance)
+        return state and state._replace(stamp_ns=stamp_ns)
 
     @property
     def _newest(self) -> Belief:
@@ -326,20 +290,19 @@ class PoseFilter:
     def health(self) -> Health:
         """What the last images show of the estimate."""
         belief = self._history.newest
-        images, placed_m = belief.memory.images, belief.track.placed_m
-        newest = newest_new(images), placed_m
-        if self._judged is None or self._judged[0] != newest:
-            self._judged = newest, health_of(belief.track, images)
+        judged = newest_new(belief.memory.images), belief.path.placed_m
+        if self._judged is None or self._judged[0] != judged:
+            self._judged = judged, health_of(belief.path, belief.memory.images)
         return self._judged[1]
 
     @property
     def status(self) -> Status:
         """How far the estimate at the newest message can be trusted, and why not further."""
-        newest = self._newest
-        state = newest.state and self._widened(newest.state)
-        status = status_of(newest, state, self.health, self.config)
-        doubts, delay_s = self._timeline.problems, self._camera.clock.delay_s
-        if abs(self._camera.clock.delay_ns) > DELAY_LIMIT_NS:
-            late = 'late' if delay_s > 0 else 'early'
-            doubts.append(f'images are stamped {abs(delay_s):.1f} s {late}: synchronize the clocks')
+        newest, clock = self._newest, self._camera.clock
+        status = status_of(newest, newest.state, self.health, self.config)
+        doubts = self._timeline.problems
+        if abs(clock.delay_ns) > DELAY_LIMIT_NS:
+            late = 'late' if clock.delay_s > 0 else 'early'
+            size = f'{abs(clock.delay_s):.1f} s {late}'
+            doubts.append(f'images are stamped {size}: synchronize the clocks')
         return status.with_reasons([], doubts)

@@ -30,14 +30,14 @@ class Measurement(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class FilterTrack:
     """Estimates in the map: `poses` with their `covariances` (N, 3, 3)."""
 
     poses: Trajectory
     covariances: Array
 
     @classmethod
-    def of(cls, states: Sequence[State]) -> Track:
+    def of(cls, states: Sequence[State]) -> FilterTrack:
         """The estimates of a filter."""
         stamps = np.array([state.stamp_ns for state in states], np.int64)
         poses = np.reshape([state.pose for state in states], (-1, 3))

@@ -34,7 +34,7 @@ class FilterConfig(Settings):
         low=0.5, high=2.0)
     odometry_factor: float = setting(
         1.0, 'factor on the variances in odometry messages', low=1e-3, high=1e4, live=True)
-    slip_per_metre: float = setting(
+    slip_per_meter: float = setting(
         0.03, 'position error by wheel slip', unit='m per sqrt(m)', low=0.0, high=10.0, live=True)
     yaw_per_radian: float = setting(
         0.04, 'heading error that grows with turning', unit='rad per sqrt(rad)',

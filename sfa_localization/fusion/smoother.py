@@ -18,22 +18,27 @@ from typing import NamedTuple
 import numpy as np
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.data.geometry import Array
-from sfa_localization.fusion.belief import Belief, Event, MeasurementEvent, OdometryEvent, PoseEvent
+from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.fusion.belief import (
+    Belief,
+    Event,
+    MeasurementEvent,
+    OdometryEvent,
+    PoseEvent,
+    symmetric,
+)
 from sfa_localization.fusion.ekf import STARTS, Ekf, Kalman
 from sfa_localization.fusion.history import History
-from sfa_localization.fusion.inputs import symmetric
-from sfa_localization.fusion.motion import YAW, State, Step, wrap
+from sfa_localization.fusion.motion import YAW, State, Step
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.timeline import HISTORY_NS
 
-# Keeps the inverse of a covariance of unit diagonal finite.
-_RIDGE = 1e-12
+_RIDGE = 1e-12  # keeps the inverse of a covariance of unit diagonal finite
 
 
-class _Link(NamedTuple):
-    """A prediction: what it started from, its Jacobian, and what it led to."""
+class _Prediction(NamedTuple):
+    """What it started from, its Jacobian, and what it led to."""
 
     before: Belief
     jacobian: Array
@@ -42,16 +47,19 @@ class _Link(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """The belief after an event, by the predictions `links` since the stage before; none at the
-    same stamp.
-
-    `follows` is False where the event set the pose.
-    """
+    """The belief after an event, by `predictions` from the stage before; none at the same stamp."""
 
     event: Event
     belief: Belief
-    links: tuple[_Link, ...]
-    follows: bool
+    predictions: list[_Prediction]
+
+    @property
+    def follows(self) -> bool:
+        """Whether the belief rests on the one before the event, which did not set the pose."""
+        if isinstance(self.event, MeasurementEvent):
+            update = self.belief.memory.update
+            return update is None or update.reason not in STARTS
+        return not isinstance(self.event, PoseEvent)
 
 
 class _Recording(Kalman):
@@ -59,18 +67,18 @@ class _Recording(Kalman):
 
     def __init__(self) -> None:
         super().__init__()
-        self.links: list[_Link] = []
+        self.predictions: list[_Prediction] = []
 
     def predicted(self, belief: Belief, step: Step) -> Array:
         covariance = super().predicted(belief, step)
-        self.links.append(_Link(belief, step.jacobian, step.mean, covariance))
+        self.predictions.append(_Prediction(belief, step.jacobian, step.mean, covariance))
         return covariance
 
 
 class Smoother(PoseFilter):
     """A pose filter that keeps all messages, so that the whole drive can be smoothed in the end.
 
-    It needs 1 kB of memory a message.
+    It needs 2 kB of memory a message.
     """
 
     def __init__(
@@ -80,35 +88,22 @@ class Smoother(PoseFilter):
         super().__init__(config, correlation)
 
     def _fresh(self, start: Belief, start_ns: int | None = None) -> History[Event, Belief]:
-        archive = list[Event]()
-        history = History(HISTORY_NS, start, self._ekf.step, start_ns, archive)
+        history = History(HISTORY_NS, start, self._ekf.step, start_ns, keep=True)
         self._pieces.append((start, history))
         return history
 
     def smoothed(self) -> list[State]:
         """The smoothed estimates at the stamps of odometry, from the first start on."""
-        states = []
-        for start, history in self._pieces:
-            states += _smoothed(self._replayed(start, history.events))
-        return states
-
-    def _replayed(self, belief: Belief, events: list[Event]) -> list[_Stage]:
-        """The stages of a drive whose messages are all in their places."""
-        kalman, stages = _Recording(), list[_Stage]()
+        states, kalman = list[State](), _Recording()
         ekf = Ekf(self.config, self.correlation, self._rig, kalman)
-        for event in events:
-            kalman.links.clear()
-            belief = ekf.step(belief, event)
-            stages.append(_Stage(event, belief, tuple(kalman.links), _follows(event, belief)))
-        return stages
-
-
-def _follows(event: Event, belief: Belief) -> bool:
-    """Whether the belief after an event rests on the one before it."""
-    if isinstance(event, MeasurementEvent):
-        update = belief.memory.update
-        return update is None or update.reason not in STARTS
-    return not isinstance(event, PoseEvent)
+        for belief, history in self._pieces:
+            stages = list[_Stage]()
+            for event in history.events:  # once more, all in their places
+                kalman.predictions = []
+                belief = ekf.step(belief, event)
+                stages.append(_Stage(event, belief, kalman.predictions))
+            states += _smoothed(stages)
+        return states
 
 
 def _smoothed(stages: list[_Stage]) -> list[State]:
@@ -125,19 +120,20 @@ def _smoothed(stages: list[_Stage]) -> list[State]:
         if isinstance(stage.event, OdometryEvent):
             states.append(State(stage.event.stamp_ns, mean, symmetric(covariance)))
         following = stage.follows
-        for link in reversed(stage.links if following else ()):
-            mean, covariance = _back(link, mean, covariance)
+        for prediction in reversed(stage.predictions if following else ()):
+            mean, covariance = _back(prediction, mean, covariance)
     return states[::-1]
 
 
-def _back(link: _Link, mean: Array, covariance: Array) -> tuple[Array, Array]:
+def _back(prediction: _Prediction, mean: Array, covariance: Array) -> tuple[Array, Array]:
     """The smoothed estimate before a prediction, from that after it."""
-    before = link.before
-    std = np.sqrt(np.maximum(np.diag(link.covariance), _RIDGE))
-    correlation = link.covariance / np.outer(std, std) + _RIDGE * np.eye(len(std))
-    gain = np.linalg.solve(correlation, (link.jacobian @ before.covariance) / std[:, None]).T / std
-    change = mean - link.mean
-    change[YAW] = wrap(float(change[YAW]))
+    before, predicted = prediction.before, prediction.covariance
+    std = np.sqrt(np.maximum(np.diag(predicted), _RIDGE))
+    correlation = predicted / np.outer(std, std) + _RIDGE * np.eye(len(std))
+    forward = prediction.jacobian @ before.covariance
+    gain = np.linalg.solve(correlation, forward / std[:, None]).T / std
+    change = mean - prediction.mean
+    change[YAW] = wrap_angle(change[YAW])
     smoothed = before.mean + gain @ change
-    smoothed[YAW] = wrap(float(smoothed[YAW]))
-    return smoothed, before.covariance + gain @ (covariance - link.covariance) @ gain.T
+    smoothed[YAW] = wrap_angle(smoothed[YAW])
+    return smoothed, before.covariance + gain @ (covariance - predicted) @ gain.T

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.fusion.belief import Belief, Event
@@ -15,14 +14,12 @@ ODOMETRY, POSE, MEASUREMENT = range(3)
 """Kinds of events, in the order in which those of one stamp follow each other."""
 HISTORY_NS = 5_000_000_000
 """How late a measurement may come: many times what any camera, network and model take."""
-LEAP_NS = 500_000_000
-"""A stamp that is ahead of all before it by more leaves the order of reception, or follows a pause:
-as much as a gap of the odometry."""
-PERIODS = 2.5
-"""Periods of the odometry that are no pause, however slow it is."""
+LEAP_NS, PERIODS = 500_000_000, 2.5
+"""A stamp leaps ahead where it lies farther than this, and than so many periods of the odometry,
+after all before it: its clock is wrong, or there was a pause."""
 FEW_AHEAD, FEW_BEHIND = 3, 5
-"""So many messages in a row that leap ahead, and messages in a row that are too late, are
-no accident: there was a pause, and the clock has gone back."""
+"""So many messages in a row that leap ahead, or are too late, are no accident: there was a pause,
+or the clock has gone back."""
 AHEAD = 'stamp ahead of those before'
 _AGAIN_NS = 300_000_000
 """Time that odometry has to cover once more until the clock is taken to have gone back."""
@@ -37,42 +34,35 @@ class Timeline:
 
     def __init__(self) -> None:
         self._behind = 0
-        # Messages in a row that leap ahead; kind and stamp of those that wait, and what takes them.
-        self._leaps, self._held = 0, list[tuple[int, int, Callable[[], object]]]()
-        self._apart, self._period_ns = (0, 0), 0
+        self._leaps: list[tuple[int, int]] = []  # kind and stamp of messages in a row
+        self._other_clock, self._period_ns = (0, 0), 0
         # Odometry in a row that is no newer than what came before it: how many of its messages lie
         # among those, and the first and last stamp.
         self._again = 0, 0, 0
 
-    def require_order(
-        self, stamp_ns: int, kind: int, history: History[Event, Belief], again: Callable[[], object]
-    ) -> None:
+    def require_order(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
         """Raises DataError for a stamp ahead of those before, which would make what follows too
-        old, or wait. Its message waits until the next ones are ahead as well, which calls `again`
-        to take it; it is left out where odometry, which keeps the time, is not ahead.
+        old, until FEW_AHEAD messages in a row are ahead. Odometry in order ends the row.
         """
         newest_ns = history.newest_ns
         if newest_ns is None or history.newest.odometry.stamp_ns is None:
             return
         ahead_ns = stamp_ns - newest_ns
         if kind == MEASUREMENT:
-            apart = abs(ahead_ns) > HISTORY_NS
-            self._apart = (self._apart[0] + 1, ahead_ns) if apart else (0, 0)
+            other = abs(ahead_ns) > HISTORY_NS
+            self._other_clock = (self._other_clock[0] + 1, ahead_ns) if other else (0, 0)
         if ahead_ns <= max(LEAP_NS, PERIODS * self._period_ns):
             if kind == ODOMETRY and ahead_ns > 0:
                 self._period_ns = ahead_ns
             far_ns = HISTORY_NS if kind == ODOMETRY else math.inf
-            self._held = [h for h in self._held if h[0] != kind and h[1] - stamp_ns <= far_ns]
-            self._leaps = len(self._held)
+            self._leaps = [
+                leap for leap in self._leaps if leap[0] != kind and leap[1] - stamp_ns <= far_ns
+            ]
             return
-        self._leaps += 1
-        if self._leaps < FEW_AHEAD:
-            self._held.append((kind, stamp_ns, again))
+        self._leaps.append((kind, stamp_ns))
+        if len(self._leaps) < FEW_AHEAD:
             raise DataError(AHEAD)
-        held, self._held = self._held, []
-        for *_, take in held:
-            take()
-        self._period_ns = stamp_ns - (history.newest_ns or stamp_ns)
+        self._period_ns, self._leaps = stamp_ns - self._leaps[-2][1], []
 
     def require_place(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
         """Raises DataError for a stamp that cannot be used, and ClockWentBack."""
@@ -81,13 +71,12 @@ class Timeline:
         newest_ns, odometry_ns = history.newest_ns, history.newest.odometry.stamp_ns
         if newest_ns is None:
             return
-        ahead_ns, keeps_time = stamp_ns - newest_ns, kind == ODOMETRY or odometry_ns is None
         reason = ''
-        if ahead_ns <= 0 and not history.reaches(stamp_ns):
+        if stamp_ns <= newest_ns and not history.reaches(stamp_ns):
             reason = 'too old'
-        elif ahead_ns <= 0 and history.holds((stamp_ns, kind)):
+        elif history.holds((stamp_ns, kind)):
             reason = 'duplicate stamp'
-        if keeps_time:
+        if kind == ODOMETRY or odometry_ns is None:  # the odometry keeps the time
             self._behind = self._behind + 1 if reason else 0
         if reason and self._behind >= FEW_BEHIND:
             raise ClockWentBack
@@ -98,22 +87,22 @@ class Timeline:
 
     @property
     def problems(self) -> list[str]:
-        """How images and odometry are apart in time, in words."""
+        """How the stamps of images and odometry disagree, in words."""
         if self._again[0] > 1:
             return ['odometry is stamped with times that it had passed: did the clock go back?']
-        if self._held:
+        if self._leaps:
             return [AHEAD]
-        count, apart_ns = self._apart
+        count, ahead_ns = self._other_clock
         if count < FEW_AHEAD:
             return []
-        where = f'{abs(apart_ns) * 1e-9:.0f} s {"ahead of" if apart_ns > 0 else "behind"}'
+        where = f'{abs(ahead_ns) * 1e-9:.0f} s {"ahead of" if ahead_ns > 0 else "behind"}'
         return [f'images are stamped {where} the odometry: are the clocks synchronized?']
 
     def _notice_again(
         self, stamp_ns: int, newest_ns: int | None, history: History[Event, Belief]
     ) -> None:
-        """Odometry that covers once more, in order, what other odometry covered before it, means
-        that the clock went back; what fills a hole, or comes out of order, was held up.
+        """Raises ClockWentBack for odometry that covers once more, in order, what other odometry
+        covered before it; what fills a hole, or comes out of order, was held up.
         """
         among, first_ns, last_ns = self._again
         if newest_ns is None or stamp_ns > newest_ns:

@@ -354,6 +354,6 @@ class EkfNode(LocalizationNode):
             values['wheel scale'] = f'{state.wheel_scale:.4f}'
             values['way lost in turns [m/rad]'] = f'{state.turn_loss:.3f}'
         clock = self.filter.camera_clock
-        if clock.known:
+        if clock.is_estimated:
             values['camera delay [s]'] = f'{clock.delay_s:.3f}'
         return _LEVELS[status.level], '; '.join(status.reasons) or status.level.name, values

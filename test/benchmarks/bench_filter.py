@@ -30,7 +30,7 @@ STEP_NS = 20_000_000
 READING = (0.8, 0.3, 4e-4, 1e-4)
 CORRELATION = ErrorCorrelation()
 NOISE = MotionNoise(
-    FilterConfig().slip_per_metre, FilterConfig().yaw_per_radian, CORRELATION.distance_m
+    FilterConfig().slip_per_meter, FilterConfig().yaw_per_radian, CORRELATION.distance_m
 )
 SPREAD = np.diag([0.04, 0.04, 0.0025])
 
