@@ -37,7 +37,7 @@ from sfa_localization.data.settings import Settings, setting
 from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
 from sfa_localization.keyframes.closures import STRETCH_M, Views, driven
-from sfa_localization.keyframes.leveling import links_between
+from sfa_localization.keyframes.leveling import tilt_pairs
 from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.metric.drive_check import ROUTE, is_one_route
 from sfa_localization.metric.motion_check import MotionCheck, check_motion
@@ -335,11 +335,11 @@ class _Survey:
             return ''
         rows, textures = np.array([n for n, _ in known]), np.concatenate([one for _, one in known])
         path = driven(odometry, stamps)[rows]
-        links = links_between(Views(textures, rows, np.zeros_like(rows), path), self._sphere)
-        tilts = links.tilts(np.zeros(len(rows), complex))
+        pairs = tilt_pairs(Views(textures, rows, np.zeros_like(rows), path), self._sphere)
+        tilts = pairs.tilts(np.zeros(len(rows), complex))
         tilt = math.degrees(math.sqrt(float(np.mean(np.abs(tilts) ** 2)) / 2))  # along each axis
         about = f'tilts the camera by at least {tilt:.1f} degrees'
-        return about if len(links.found) >= FEWEST_LINKS else ''
+        return about if len(pairs.tilt) >= FEWEST_LINKS else ''
 
     def _topic(self, stream: Stream) -> TopicReport:
         topic = self._bag.topics[stream.topic]

@@ -16,7 +16,7 @@ from sfa_localization.data.statistics import share_within
 from sfa_localization.keyframes.closures import Views
 from sfa_localization.keyframes.errors import ErrorModel, LeftOut
 from sfa_localization.keyframes.keyframes import Keyframes
-from sfa_localization.keyframes.training import choose_keyframes, located_without, spread
+from sfa_localization.keyframes.training import choose_keyframes, located_without
 from sfa_localization.metric.forecast import ground_distances, importance
 from sfa_localization.metric.learning import MetricResult
 from sfa_localization.metric.segments import Segments, assignment
@@ -58,8 +58,7 @@ def learn_keyframes(
     """
     _, seen, row = np.intersect1d(views.images, result.images, return_indices=True)
     poses, drives = result.poses[row], views.run[seen].astype(np.int32)
-    keyframes = choose_keyframes(views.textures[seen], poses, sphere, drives)
-    kept = spread(poses)
+    keyframes, kept = choose_keyframes(views.textures[seen], poses, sphere, drives)
     path, rows = _along_tracks(views, segments)[seen][kept], row[kept]
     tried, fits, near_m = located_without(keyframes, path)
     shared = {'map_m': result.map.common_m, 'turn_std': usual_turn_std(result.angle_covariance)}
