@@ -36,7 +36,7 @@ from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
 from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
-from sfa_localization.keyframes.closures import STRETCH_M, Views, driven
+from sfa_localization.keyframes.closures import STRETCH_M, Textures, driven
 from sfa_localization.keyframes.leveling import tilt_pairs
 from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.metric.drive_check import ROUTE, is_one_route
@@ -335,7 +335,7 @@ class _Survey:
             return ''
         rows, textures = np.array([n for n, _ in known]), np.concatenate([one for _, one in known])
         path = driven(odometry, stamps)[rows]
-        pairs = tilt_pairs(Views(textures, rows, np.zeros_like(rows), path), self._sphere)
+        pairs = tilt_pairs(Textures(textures, rows, np.zeros_like(rows), path), self._sphere)
         tilts = pairs.tilts(np.zeros(len(rows), complex))
         tilt = math.degrees(math.sqrt(float(np.mean(np.abs(tilts) ** 2)) / 2))  # along each axis
         about = f'tilts the camera by at least {tilt:.1f} degrees'

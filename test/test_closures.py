@@ -22,7 +22,7 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform, align, wrap_angle
 from sfa_localization.data.run import PanoramaArray
-from sfa_localization.keyframes.closures import STRETCH_M, Closures, Views, find_closures
+from sfa_localization.keyframes.closures import STRETCH_M, Closures, Textures, find_closures
 from sfa_localization.keyframes.offsets import Offsets, find_offsets
 from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.metric import selection
@@ -50,7 +50,7 @@ def wander(count: int, seed: int) -> np.ndarray:
     return np.column_stack([places, np.cumsum(rng.normal(0, 0.3, count))])
 
 
-def views(world: Spheres, drives: list[np.ndarray], config: PanoramaConfig, gamma=1.0) -> Views:
+def views(world: Spheres, drives: list[np.ndarray], config: PanoramaConfig, gamma=1.0) -> Textures:
     textures, parts = [], []
     for number, poses in enumerate(drives):
         images = world.panoramas(poses, config)
@@ -60,7 +60,7 @@ def views(world: Spheres, drives: list[np.ndarray], config: PanoramaConfig, gamm
         parts.append(np.cumsum(steps))
     count = sum(len(poses) for poses in drives)
     run = np.repeat(np.arange(len(drives)), [len(poses) for poses in drives])
-    return Views(np.concatenate(textures), np.arange(count), run, np.concatenate(parts))
+    return Textures(np.concatenate(textures), np.arange(count), run, np.concatenate(parts))
 
 
 @pytest.mark.parametrize('config', [CONFIG, COUNTER])
@@ -83,7 +83,7 @@ def test_closures_are_of_one_place_and_know_the_turn(config):
 
 def test_strange_places_close_no_loop():
     here, there = (views(Spheres.about(n), [wander(150, n)], CONFIG) for n in (0, 5))
-    both = Views(
+    both = Textures(
         np.concatenate([here.textures, there.textures]),
         np.arange(300),
         np.repeat([0, 1], 150),

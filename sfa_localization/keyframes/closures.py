@@ -55,7 +55,7 @@ class Closures:
 
 
 @dataclass(frozen=True, slots=True)
-class Views:
+class Textures:
     """Images in driving order: `textures` (S, rows, columns), their indices `images` (S,) among
     those of all drives, the drive `run` (S,) and the distance driven in it until each, (S,) m.
     """
@@ -65,9 +65,9 @@ class Views:
     run: Indices
     path_m: Array
 
-    def take(self, rows: NDArray[Any]) -> Views:
+    def take(self, rows: NDArray[Any]) -> Textures:
         """Some of the images, by a mask (S,) or indices."""
-        return Views(self.textures[rows], self.images[rows], self.run[rows], self.path_m[rows])
+        return Textures(self.textures[rows], self.images[rows], self.run[rows], self.path_m[rows])
 
     def near(self, row: int, rows: Indices) -> NDArray[np.bool_]:
         """Which of the images `rows` (M,) are of the same stretch of driving as another one."""
@@ -79,7 +79,7 @@ def views_of(
     runs: Sequence[Run],
     on_images: Callable[[int], object] = lambda count: None,
     chosen: Indices | None = None,
-) -> Views:
+) -> Textures:
     """The `chosen` images of all runs, by default all; `on_images` counts the images."""
     counts = [len(run.panoramas) for run in runs]
     chosen = np.arange(sum(counts)) if chosen is None else chosen
@@ -90,7 +90,7 @@ def views_of(
         textures.append(texture(runs[number].panoramas.read(at, at + 1)[0]))
         on_images(1)
     path = np.concatenate([driven(r.odometry, r.panoramas.stamps_ns) for r in runs])[chosen]
-    return Views(quantized(np.stack(textures)), chosen, run, path)
+    return Textures(quantized(np.stack(textures)), chosen, run, path)
 
 
 def driven(odometry: Odometry, stamps_ns: Stamps) -> Array:
@@ -107,7 +107,7 @@ def driven(odometry: Odometry, stamps_ns: Stamps) -> Array:
 class ImageSearch:
     """Finds the images that are alike among those of `views`, by their `spectra` (S, rows, F)."""
 
-    def __init__(self, views: Views) -> None:
+    def __init__(self, views: Textures) -> None:
         self.views, self.spectra = views, spectra_of(views.textures)
         self._coarse = coarse(self.spectra)
 
@@ -124,7 +124,7 @@ class ImageSearch:
         return correlate(self.spectra[row], self.spectra[rows], self.views.textures.shape[2])
 
 
-def find_closures(views: Views, clockwise: bool) -> Closures:
+def find_closures(views: Textures, clockwise: bool) -> Closures:
     """Images of two drives, or of a drive with itself, each of which is the likest of the other, or
     a neighbor of that, if they are like enough; of an even sample, whose pairs are all compared.
     `clockwise`: whether columns grow clockwise seen from above.

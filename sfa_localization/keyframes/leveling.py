@@ -24,7 +24,7 @@ from sfa_localization.camera.leveling import TILTED_RAD, LeveledPanoramas
 from sfa_localization.data.geometry import Complex, Indices
 from sfa_localization.data.run import Run
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.keyframes.closures import LIKE, SAMPLES, ImageSearch, Views, views_of
+from sfa_localization.keyframes.closures import LIKE, SAMPLES, ImageSearch, Textures, views_of
 from sfa_localization.keyframes.texture import channels
 from sfa_localization.keyframes.tilt import find_tilt
 
@@ -86,7 +86,7 @@ class TiltPairs:
         return np.asarray(spsolve(squares, right))
 
 
-def tilt_pairs(views: Views, sphere: Sphere) -> TiltPairs:
+def tilt_pairs(views: Textures, sphere: Sphere) -> TiltPairs:
     """Pairs of each image and those that it is likest, along other stretches of driving."""
     search, rows = ImageSearch(views), np.arange(len(views.images))
     _, height, columns = views.textures.shape

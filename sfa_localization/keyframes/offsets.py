@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, Indices, wrap_angle
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.keyframes.closures import Views
+from sfa_localization.keyframes.closures import Textures
 from sfa_localization.keyframes.keyframes import NEIGHBORS, Keyframes
 
 # Spacing of the views that are located, along a drive or in a turn, which shows where the camera
@@ -53,7 +53,7 @@ class Offsets:
         return replace(self, turn=turn)
 
 
-def find_offsets(views: Views, poses: Array, sphere: Sphere) -> Offsets:
+def find_offsets(views: Textures, poses: Array, sphere: Sphere) -> Offsets:
     """Offsets of views by their rough poses (S, 3) in any frame; NaN for views without one."""
     placed = np.flatnonzero(np.isfinite(poses).all(axis=1))
     views, poses = views.take(placed), poses[placed]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.rig import Quantity
 from sfa_localization.data.statistics import evenly
-from sfa_localization.keyframes.closures import Views
+from sfa_localization.keyframes.closures import Textures
 from sfa_localization.keyframes.correlation import correlate
 from sfa_localization.keyframes.texture import spectra_of
 
@@ -34,7 +34,7 @@ it should be, in five drives)."""
 _LAGS, _MOST, _FEWEST, _GROUPS = 13, 2000, 30, 6
 
 
-def lever_square(views: Views, yaw: Array) -> Quantity | None:
+def lever_square(views: Textures, yaw: Array) -> Quantity | None:
     """|l|^2, m^2, with its standard deviation by the scatter, by views with headings (S,) rad of
     odometry; None where there are too few turns, or no way to compare them with.
     """

@@ -20,7 +20,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import Points, Run, Stamps
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.keyframes.closures import Closures, Views
+from sfa_localization.keyframes.closures import Closures, Textures
 from sfa_localization.keyframes.offsets import Offsets, find_offsets
 from sfa_localization.keyframes.turning import lever_square
 from sfa_localization.metric.anchors import Anchors, Settled, settle
@@ -139,7 +139,7 @@ class Drives:
         yaw = self.mount.of(len(self.items)).yaw
         return np.repeat(yaw, [len(drive.run.panoramas) for drive in self.items])
 
-    def measured(self, views: Views, sphere: Sphere) -> Drives:
+    def measured(self, views: Textures, sphere: Sphere) -> Drives:
         """With the offsets of `views`, which the graph of odometry and closures leads to, and the
         place of the camera, which both show together."""
         turns = np.concatenate(list(self._yaws()))[views.images]

@@ -13,7 +13,7 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.data.statistics import share_within
-from sfa_localization.keyframes.closures import Views
+from sfa_localization.keyframes.closures import Textures
 from sfa_localization.keyframes.errors import ErrorModel, LeftOut
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.training import choose_keyframes, located_without
@@ -51,7 +51,7 @@ class KeyframeMap:
 
 
 def learn_keyframes(
-    views: Views, segments: Segments, result: MetricResult, sphere: Sphere, turn_radius_m: float
+    views: Textures, segments: Segments, result: MetricResult, sphere: Sphere, turn_radius_m: float
 ) -> KeyframeMap:
     """Keyframes where the certified solution puts the images of `views`; along the drive a turn
     counts as `turn_radius_m` per rad. Raises DataError for too few.
@@ -96,7 +96,7 @@ def usual_turn_std(covariance: Array) -> float:
     return float(np.sqrt(np.median(np.diag(covariance))))
 
 
-def _along_tracks(views: Views, segments: Segments) -> Array:
+def _along_tracks(views: Textures, segments: Segments) -> Array:
     """Distance (S,) m driven until each image, far apart between drives; of a segment along an
     earlier track it is that of the earlier one."""
     path = views.path_m + _ANOTHER_DRIVE_M * views.run
