@@ -24,6 +24,8 @@ from sfa_localization.bags.reader import KINDS, Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera import kinds
+from sfa_localization.camera.panorama import looks_like_panorama
+from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import BagError, MessageError
@@ -34,7 +36,9 @@ from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
 from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
-from sfa_localization.keyframes.closures import STRETCH_M
+from sfa_localization.keyframes.closures import STRETCH_M, Textures, driven
+from sfa_localization.keyframes.leveling import tilt_pairs
+from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.metric.drive_check import ROUTE, is_one_route
 from sfa_localization.metric.motion_check import MotionCheck, check_motion
 from sfa_localization.metric.motion_sources import IMAGES, POSE, late
@@ -54,6 +58,7 @@ EVEN, EVEN_SHARE = 3.0, 0.9  # a topic is periodic if this share of intervals is
 MAX_REPEATED = 0.05  # share of images that repeat the last one; more are reported
 STANDING_M = 0.02  # between images of a robot that stands
 GRID = 100  # points per axis at which coverage is evaluated
+TILT_IMAGES, TILT_PAIRS = 400, 50  # images compared for the ground's tilt, and pairs it takes
 DARK = 12.0  # mean gray level of 255 below which an image is dark
 
 # Pairs of images at a place with different headings show the lever arm of the camera.
@@ -265,7 +270,9 @@ class _Survey:
         self._gyro, self._frozen, self._repeats = VisualGyro(clockwise), FrozenWatch(), 0
         self._sizes: Counter[tuple[int, ...]] = Counter()
         count = bag.topics[self._image].count if self._image else 0
-        self._every = max(count // SAMPLES, 1)
+        self._every, self._tilt_every = max(count // SAMPLES, 1), -(-count // TILT_IMAGES) or 1
+        self._sphere = PanoramaConfig(clockwise=clockwise).sphere
+        self._textures: dict[int, NDArray[np.int8]] = {}
         self._rolls_and_pitches: list[tuple[float, float]] = []
 
     def fill(self) -> None:
@@ -310,6 +317,9 @@ class _Survey:
             scale = min(SAMPLE_SIDE / max(image.shape[:2]), 1.0)
             small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
             samples.append(np.asarray(small, np.uint8))
+        number = self._sizes.total()
+        if number % self._tilt_every == 0 and looks_like_panorama(*image.shape[:2]):
+            self._textures[number] = quantized(texture(image)[None])
         self._sizes[image.shape[:2]] += 1
         yaw = self._gyro.add(kinds.unrolled(image))
         return yaw, self._gyro.texture if new else None
@@ -355,11 +365,28 @@ class _Survey:
         if self._rolls_and_pitches:
             tilt = np.degrees(np.std(self._rolls_and_pitches, 0).mean())
             report.tilt = f'tilts the robot by {tilt:.1f} degrees'
+        else:
+            report.tilt = self._camera_tilt(driven(odometry, stamps))
         turns = (stamps, yaw) if camera is not None and camera.shows_turns else None
         rates = self._values.get(self._imu, [])
         gyro = to_yaw_rate(sorted(rates)) if rates else None
         is_panorama = camera is not None and camera.is_panorama
         report.motion = check_motion(odometry, turns, gyro, is_panorama, views)
+
+
+    def _camera_tilt(self, path_m: Array) -> str:
+        """How the ground tilts the camera, by pairs of images after `path_m` (N,) of driving."""
+        if len({textures.shape for textures in self._textures.values()}) != 1:
+            return ''
+        rows = np.array([number for number in self._textures if number < len(path_m)])
+        textures = np.concatenate([self._textures[number] for number in rows.tolist()])
+        images = Textures(textures, rows, np.zeros_like(rows), path_m[rows])
+        pairs = tilt_pairs(images, self._sphere)
+        if len(pairs.tilt) < TILT_PAIRS:
+            return ''
+        squares = np.abs(pairs.tilts(np.zeros(len(rows), complex))) ** 2
+        tilt = math.degrees(math.sqrt(float(squares.mean()) / 2))  # along each axis
+        return f'tilts the camera by at least {tilt:.1f} degrees'
 
 
 def path_length(poses: Array) -> float:

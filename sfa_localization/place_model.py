@@ -57,7 +57,7 @@ VERSION = 15
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What an image shows before its heading is known: itself `upright`, its slow features (K,),
+    """What an image shows before its heading is known: the `upright` image, its slow features (K,),
     and the `spectrum` (H, J) of the layer that is turned.
     """
 
@@ -70,10 +70,10 @@ class View:
 class PlaceModel:
     """Network, metric map and keyframes, learned from one place.
 
-    `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the
-    figures of merit of the training; `error_correlation` is that of the errors of
-    neighboring images, `rig` the robot. Map and keyframes hold places of the camera. The map reads
-    `turned` maps, or slow features where there are none.
+    `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the figures
+    of merit of the training, `error_correlation` that of neighboring images, `rig` the robot. Map
+    and keyframes hold places of the camera. The map reads `turned` maps, or slow features where
+    there are none.
     """
 
     network: Network
@@ -88,7 +88,7 @@ class PlaceModel:
     def locate(self, panorama: Image) -> Observation:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
 
-        Raises ModelError when it is none, or its size is not `self.panorama`'s.
+        Raises ModelError for anything else, and for another size than that of `self.panorama`.
         """
         require_panorama(panorama)
         return self.locate_all(panorama[None])[0]
@@ -96,11 +96,11 @@ class PlaceModel:
     @one_core()
     def locate_all(self, panoramas: Image) -> list[Observation]:
         """What panoramas (T, H, W, 3) show, each by itself."""
-        seen = [(view, self.located(view, Conditions())) for view in self.views(panoramas)]
-        return [self.observed(view, location) for view, location in seen]
+        views = self.views(panoramas)
+        return [self.observed(view, self.located(view, Conditions())) for view in views]
 
     def views(self, panoramas: Image) -> list[View]:
-        """What the network makes of panoramas (T, H, W, 3), leveled by keyframes."""
+        """Views of panoramas (T, H, W, 3), leveled by keyframes."""
         require_size(panoramas, self.network.architecture)
         level = [upright(self.keyframes, image) for image in panoramas]
         maps = self.network.maps(np.stack([image.panorama for image in level]))
@@ -108,39 +108,38 @@ class PlaceModel:
         return list(map(View, level, slow_features(maps), spectra))
 
     def located(self, view: View, conditions: Conditions) -> Location:
-        """Where the camera was, by keyframes and slow features in the conditions of late."""
+        """Where the camera was, by keyframes and slow features in the current conditions."""
         likely, tilt = hypotheses(self.keyframes, view.upright, conditions.pattern)
         slow = self._slow_places(view, likely)
         return located(likely, slow, conditions.scales, self.keyframes.errors, tilt)
 
     def _slow_places(self, view: View, likely: Sequence[Hypothesis]) -> list[SlowPlace]:
-        """Where the map puts an image, turned by the heading of each hypothesis; one that is
-        uncertain makes the place so, too.
+        """Where the map puts an image at the heading of each hypothesis; the variance includes that
+        of the heading.
         """
         if self.turned is None:
             places, covariances = self.metric.predict(view.slow_features)
             return [SlowPlace(places[0], float(covariances[0, 0, 0]))] * len(likely)
-        yaw = np.array([one.fit.yaw for one in likely])
-        variance = self.keyframes.errors.yaw_variance(np.array([one.fit.unlike for one in likely]))
+        yaw, unlike = np.array([(h.fit.yaw, h.fit.unlike) for h in likely]).T
+        variance = self.keyframes.errors.yaw_variance(unlike)
         spectra = np.repeat(view.spectrum[None], len(yaw), axis=0)
         places, covariances, by_yaw = self.turned.predict(self.metric, spectra, yaw, variance)
         variances = np.trace(covariances + by_yaw, axis1=1, axis2=2) / 2
         return list(map(SlowPlace, places, variances.tolist()))
 
     def observed(self, view: View, location: Location) -> Observation:
-        """The pose of base_link, with what is uncertain of all alike: the errors of the map, and
-        its scale about its center.
+        """The pose of base_link; its covariance includes the errors that all images share: those of
+        the map, and of its scale about its center.
         """
         errors, center = self.keyframes.errors, self.keyframes.poses[:, :2].mean(0)
-        covariance = (
-            location.covariance + np.diag([errors.map_m, errors.map_m, errors.turn_std]) ** 2
-        )
+        of_map = np.array([errors.map_m, errors.map_m, errors.turn_std])
+        covariance = location.covariance + np.diag(of_map**2)
         by_scale = self.rig.wheel_scale.std * (location.pose[:2] - center)
         covariance[:2, :2] += np.outer(by_scale, by_scale)
         pose, covariance = self.rig.base(location.pose, covariance, location.facing)
         covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
-        shown = view.slow_features, location.fit.explained
-        return Observation(pose, covariance, *shown, tilt=location.tilt)
+        explained, tilt = location.fit.explained, location.tilt
+        return Observation(pose, covariance, view.slow_features, explained, tilt=tilt)
 
     def save(self, path: Path) -> None:
         """Write to `path` completely or not at all; the same model gives the same bytes."""
@@ -158,20 +157,20 @@ class PlaceModel:
         except LocalizationError as error:
             raise _damaged(path, str(error)) from None
         except Exception:  # header and arrays that do not fit each other fail in many ways
-            raise _damaged(path, 'its parts do not fit each other') from None
+            raise _damaged(path, 'its parts do not fit together') from None
         return model
 
     def _prove(self) -> None:
-        """Locate two images, so that the first of a drive neither fails nor waits.
+        """Check the parts, and locate two images, so that the first one of a drive does not wait.
 
-        Raises ModelError where the results are not finite, or certain beyond reason.
+        Raises ModelError where the parts do not fit, or a covariance is not positive definite.
         """
         check_weights(self.network)
         if self.turned is not None and abs(self.turned.sign) != 1.0:
-            raise ModelError('it turns neither way')
+            raise ModelError('the direction of its columns is neither 1 nor -1')
         height, width = self.network.architecture.size
         if (height, width) != (self.panorama.height, self.panorama.width):
-            raise ModelError('network and panorama are of different sizes')
+            raise ModelError('network and panorama differ in size')
         noise = np.random.default_rng(0).integers(0, 256, (1, height, width, 3), np.uint8)
         with np.errstate(all='ignore'):
             estimates = self.locate_all(np.concatenate([noise, np.zeros_like(noise)]))
@@ -179,7 +178,7 @@ class PlaceModel:
             if not (estimate.finite and np.isfinite(estimate.explained)):
                 raise ModelError('its estimates are not finite')
             if np.linalg.eigvalsh(estimate.covariance)[0] <= 0:
-                raise ModelError('its covariances are not positive')
+                raise ModelError('its covariances are not positive definite')
 
     def _header(self) -> dict[str, Any]:
         architecture = dataclasses.asdict(self.network.architecture)
@@ -223,12 +222,12 @@ class PlaceModel:
 
 def require_panorama(image: object) -> None:
     """Raise ModelError for anything but an array (H, W, 3) uint8."""
-    found = type(image).__name__
+    kind = type(image).__name__
     if isinstance(image, np.ndarray):
-        found = f'{image.shape} {image.dtype}'
+        kind = f'{image.shape} {image.dtype}'
         if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
             return
-    raise ModelError(f'a panorama is (H, W, 3) uint8, not {found}')
+    raise ModelError(f'a panorama is (H, W, 3) uint8, not {kind}')
 
 
 def _damaged(path: Path, reason: str) -> ModelError:
@@ -245,7 +244,7 @@ def network_from(arrays: Arrays, header: Mapping[str, Any]) -> Network:
     )
     architecture = Architecture(**spec)
     if sum(name.endswith('/linear_offset') for name in arrays) != len(architecture.layers):
-        raise ModelError('its layers are not those of its weights')
+        raise ModelError('it has weights of more or fewer layers than its network')
     nodes, deltas = [], []
     for depth in range(len(architecture.layers)):
         part = _under(arrays, f'network/{depth}/')

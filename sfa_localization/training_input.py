@@ -17,7 +17,7 @@ from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.progress import announce, progress_bar
 from sfa_localization.data.run import Run
 from sfa_localization.fusion.camera_clock import camera_clock
-from sfa_localization.keyframes.closures import Views, find_closures, views_of
+from sfa_localization.keyframes.closures import Textures, find_closures, views_of
 from sfa_localization.keyframes.leveling import leveled_runs
 from sfa_localization.metric.drives import Drive, Drives
 from sfa_localization.metric.motion_check import MotionCheck, check_drives
@@ -56,7 +56,7 @@ class TrainingInput:
     """Drives with camera clocks and loop closures, the `views` that show them, and the recipe."""
 
     drives: Drives
-    views: Views
+    views: Textures
     recipe: Recipe
     progress: bool = False
 

@@ -34,7 +34,7 @@ from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
-from sfa_localization.keyframes.keyframes import Keyframes, encoded, parts_of
+from sfa_localization.keyframes.keyframes import Keyframes, encoded
 from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.keyframes.training import fit_among
 from sfa_localization.localizer import Observation, Observer, filter_of
@@ -211,7 +211,7 @@ def extended(model: PlaceModel, new: Additions, name: str) -> PlaceModel:
     if not len(new):
         return model
     old, rows = model.keyframes, _kept(model.keyframes, new.poses)
-    values, _ = encoded(parts_of(new.textures, new.poses, old.sphere), old.step)
+    values, _ = encoded(new.textures, new.poses, old.sphere, old.step)
     keyframes = replace(
         old,
         values=np.concatenate([old.values[rows], values]),

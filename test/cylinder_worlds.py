@@ -18,7 +18,7 @@ from sfa_localization.keyframes.errors import LeftOut
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.light import Conditions
 from sfa_localization.keyframes.location import SlowPlace, hypotheses, located
-from sfa_localization.keyframes.training import choose_keyframes, located_without, spread
+from sfa_localization.keyframes.training import choose_keyframes, located_without
 from sfa_localization.keyframes.upright import upright
 from sfa_localization.metric.settings import MetricConfig
 from sfa_localization.sfa.network import Architecture, Layer
@@ -114,8 +114,8 @@ def run_in(world: Spheres, odometry: Odometry, config: PanoramaConfig, name: str
 
 def learnt_keyframes(textures, poses, path_m, sphere: Sphere, drives) -> Keyframes:
     """As `choose_keyframes`, with the errors of some that are left out, which all count alike."""
-    keyframes = choose_keyframes(textures, poses, sphere, drives)
-    tried, fits, _ = located_without(keyframes, path_m[spread(poses)])
+    keyframes, rows = choose_keyframes(textures, poses, sphere, drives)
+    tried, fits, _ = located_without(keyframes, path_m[rows])
     trials = LeftOut.of(fits, keyframes.poses[tried], np.full(len(tried), 1 / len(tried)))
     return replace(keyframes, errors=trials.learn())
 

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from sfa_localization.keyframes.regression import Fit, Neighbors, vectors_of
+from sfa_localization.keyframes.regression import Fit, regress
 from sfa_localization.keyframes.texture import normalized, spectrum, turned
 
 ROWS = 8
@@ -53,8 +53,7 @@ def fit_among(image, keyframes, places, columns, channels=None, drives=None) -> 
     drives = np.zeros(len(places), np.int32) if drives is None else drives
     by_turn = (image * 1j * np.arange(image.shape[1])).astype(np.complex64)
     changes = np.stack([image, 0 * image, 0 * image, by_turn])
-    vectors = vectors_of(keyframes, columns)
-    return Neighbors(vectors, places, drives, channels, columns).fit(changes)
+    return regress(changes, keyframes, places, drives, channels, columns)
 
 
 @SIZES

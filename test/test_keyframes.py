@@ -17,7 +17,7 @@ from sfa_localization.keyframes.errors import ErrorModel
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.location import Location
 from sfa_localization.keyframes.texture import quantized, texture
-from sfa_localization.keyframes.training import choose_keyframes, spread
+from sfa_localization.keyframes.training import choose_keyframes
 from sfa_localization.metric.keyframe_map import usual_turn_std
 
 CONFIG = PanoramaConfig(width=120, height=24)
@@ -213,27 +213,25 @@ def test_each_drive_of_the_training_shows_the_place_in_its_own_light():
         assert joint < 1.25 * best and joint < worst / 2
 
 
-def test_many_images_are_thinned_evenly_and_too_few_rejected():
+@pytest.mark.parametrize(('often', 'everywhere', 'number'), [(0, 4000, 2000), (9000, 16000, 3200)])
+def test_many_images_are_thinned_evenly(often, everywhere, number):
+    """Two keyframes on each square meter of a large place, however often the robot came by."""
     rng = np.random.default_rng(0)
-    poses = np.column_stack([rng.uniform(-5, 5, (4000, 2)), np.zeros(4000)])
-    textures = quantized(rng.normal(size=(4000, 8, 24)).astype(np.float32))
-    one_drive = np.zeros(4000, np.int32)
-    keyframes = choose_keyframes(textures, poses, CONFIG.sphere, one_drive)
-    assert len(keyframes.poses) == 2000
-    counts, _, _ = np.histogram2d(*keyframes.poses[:, :2].T, bins=5)
-    assert counts.min() > 50
+    reach = 5 if everywhere == 4000 else 20
+    places = rng.uniform(-5, 3, (often, 2)), rng.uniform(-reach, reach, (everywhere, 2))
+    poses = np.column_stack([np.concatenate(places), np.zeros(often + everywhere)])
+    textures = quantized(rng.normal(size=(len(poses), 8, 12)).astype(np.float32))
+    drives = np.zeros(len(poses), np.int32)
+    keyframes, rows = choose_keyframes(textures, poses, CONFIG.sphere, drives)
+    assert len(rows) == number and np.array_equal(keyframes.poses, poses[rows])
+    counts, _, _ = np.histogram2d(*poses[rows, :2].T, bins=np.arange(-reach, reach + 1))
+    assert counts.min() >= 1 and counts.max() <= 1.5 * number / counts.size
+
+
+def test_too_few_images_are_refused():
+    textures, drives = np.zeros((3, 8, 24), np.int8), np.zeros(3, np.int32)
     with pytest.raises(DataError, match='too few'):
-        choose_keyframes(textures[:3], poses[:3], CONFIG.sphere, one_drive[:3])
-
-
-def test_large_places_have_keyframes_on_each_square_meter():
-    rng = np.random.default_rng(0)
-    often, all_over = rng.uniform(0, 8, (9000, 2)), rng.uniform(0, 40, (16000, 2))
-    poses = np.column_stack([np.concatenate([often, all_over]), np.zeros(25000)])
-    kept = poses[spread(poses)]
-    assert len(kept) == 2 * 1600
-    counts, _, _ = np.histogram2d(*kept[:, :2].T, bins=np.arange(41))
-    assert counts.min() >= 1 and counts.max() <= 3
+        choose_keyframes(textures, np.zeros((3, 3)), CONFIG.sphere, drives)
 
 
 def posts() -> np.ndarray:

@@ -19,7 +19,7 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity, Rig
-from sfa_localization.keyframes.closures import Views
+from sfa_localization.keyframes.closures import Textures
 from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.keyframes.turning import lever_square
 from sfa_localization.metric.dead_reckoning import OdometryTrack
@@ -272,9 +272,9 @@ def test_images_change_in_turns_as_far_as_the_camera_moves(lever):
     textures = np.concatenate([quantized(texture(image)[None]) for image in images])
     path = np.concatenate([np.zeros(61), 10.0 + np.linspace(0.0, 3.0, 31)])
     count = np.arange(len(base))
-    seen = lever_square(Views(textures, count, np.zeros_like(count), path), base[:, 2])
+    seen = lever_square(Textures(textures, count, np.zeros_like(count), path), base[:, 2])
     assert abs(np.sqrt(seen.value) - abs(lever)) < 0.05 + 0.5 * abs(lever)
-    few = Views(textures[:20], count[:20], np.zeros(20, int), path[:20])
+    few = Textures(textures[:20], count[:20], np.zeros(20, int), path[:20])
     assert lever_square(few, base[:20, 2]) is None
 
 

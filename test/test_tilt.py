@@ -17,7 +17,7 @@ from sfa_localization.data.run import PanoramaArray
 from sfa_localization.data.sphere import Sphere, rotation
 from sfa_localization.keyframes.closures import views_of
 from sfa_localization.keyframes.keyframes import Keyframes
-from sfa_localization.keyframes.leveling import leveled_runs, links_between
+from sfa_localization.keyframes.leveling import leveled_runs, tilt_pairs
 from sfa_localization.keyframes.texture import spectrum, texture, turned
 from sfa_localization.keyframes.tilt import derivatives, find_tilt
 from sfa_localization.keyframes.upright import upright
@@ -159,7 +159,7 @@ def test_drives_are_leveled_before_they_are_learned_from(clockwise):
     assert set(counted) == {1} and np.array_equal(run.panoramas.images, images)
     rest = np.hypot(*(found.panoramas.tilts - tilts).T)
     assert np.median(rest) < 0.25 * np.median(np.hypot(*tilts.T))
-    before, after = (links_between(views_of([one]), panorama.sphere).usual for one in (run, found))
+    before, after = (tilt_pairs(views_of([each]), panorama.sphere).median for each in (run, found))
     assert after < 0.5 * before
     batches = np.concatenate(list(found.panoramas.batches(64)))
     assert np.array_equal(batches, found.panoramas.read(0, 240)) and len(found.panoramas) == 240

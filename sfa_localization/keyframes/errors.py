@@ -2,16 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """How well images are located: variances whose parameters are learned from images left out.
 
-Along each axis, an image of which no place explains u (`Fit.unlike`), so far outward o from the
-middle of its keyframes, and whose residual moves it by s, is where keyframes put it with variance
+Keyframes locate an image along each axis with variance
 
     v_k = f^2 + (a s)^2 + (b o ln(1 + u))^2,
 
-for likeness decays exponentially with the distance; and slow features, whose map claims a variance
-c, put it with v_s = g c + (h ln(1 + u))^2. The five are those that make the true places of images
-likeliest that both were learned without: first f, a and b by keyframes alone, then g and h by both
-together, so that what errs in both is counted. Errors are Student's: see `surprise`. a is at least
-1, for s shows what light does also where all images are of one light.
+where u is the part that no place explains (`Fit.unlike`), o how far outward of the keyframes the
+image is, and s how far its residual moves the place; the logarithm, because likeness decays
+exponentially with the distance. Slow features, whose map claims a variance c, locate it with
+v_s = g c + (h ln(1 + u))^2. The parameters maximize the likelihood of the true places of images
+left out: first f, a and b by keyframes alone, then g and h by both together, so that errors which
+both share are counted. Errors are Student's: see `surprise`. a is at least 1, because s shows what
+light does also where all images are of one light.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ LEAST_STD, LEAST_M = 1e-3, 0.01
 
 @dataclass(frozen=True, slots=True)
 class ErrorModel:
-    """The parameters, and what images that are left out do not show: errors that all share.
+    """The parameters, and the errors that all images share, which images left out do not show.
 
     `floor_m` is f, `residual` a, `outward_m` b, `slow` g, `slow_m` h. `yaw_std` rad is the
     standard deviation of a heading, times 1 + u. `map_m` and `turn_std` rad are those of the map,
@@ -66,7 +67,7 @@ class ErrorModel:
 class LeftOut:
     """M images that were located without their stretch of driving: `unlike`, `outward` and the
     `variance` m^2 of each `Fit`, the `error` (M, 2) m, the error `turn` (M,) rad of the heading,
-    and how much each counts, `weight` (M,) of sum 1.
+    and the `weight` (M,) of each, of sum 1.
     """
 
     unlike: Array
@@ -85,61 +86,50 @@ class LeftOut:
         return cls(unlike, outward, variance, error, wrap_angle(yaw - poses[:, 2]), weight)
 
     def learn(self) -> ErrorModel:
-        """f, a and b, and that of the heading."""
+        """f, a, b and the standard deviation of headings."""
         yaw_std = MEDIAN_TO_STD * float(np.median(np.abs(self.turn) / (1 + self.unlike)))
-        start = ErrorModel(yaw_std=max(yaw_std, LEAST_STD))
-
-        def tried(f: float, a: float, b: float) -> ErrorModel:
-            return replace(start, floor_m=f, residual=a, outward_m=b)
-
-        return tried(
-            *_likeliest(
-                lambda *numbers: self._surprise(self.error, self._variances(tried(*numbers))),
-                (start.floor_m, start.residual, start.outward_m),
-                least=(LEAST_M, 1.0, LEAST_STD),
-            )
+        return self._likeliest(
+            ErrorModel(yaw_std=max(yaw_std, LEAST_STD)),
+            {'floor_m': LEAST_M, 'residual': 1.0, 'outward_m': LEAST_STD},
+            lambda errors: (self.error, self._variances(errors)),
         )
 
     def learn_slow(self, errors: ErrorModel, error: Array, claimed: Array) -> ErrorModel:
         """g and h: slow features, whose map claims variances (M,) m^2, err by (M, 2) m."""
-
-        def tried(root: float, h: float) -> ErrorModel:
-            return replace(errors, slow=root**2, slow_m=h)
-
-        return tried(
-            *_likeliest(
-                lambda *numbers: self._surprise(*self.fused(tried(*numbers), error, claimed)),
-                (math.sqrt(errors.slow), errors.slow_m),
-            )
+        return self._likeliest(
+            errors,
+            {'slow': LEAST_STD**2, 'slow_m': LEAST_STD},
+            lambda errors: self.fused(errors, error, claimed),
         )
 
     def fused(self, errors: ErrorModel, error: Array, claimed: Array) -> tuple[Array, Array]:
         """Errors (M, 2) m of both together, and their variances (M,) m^2 along each axis."""
-        own = self._variances(errors)
-        other = errors.slow_variance(claimed, self.unlike)
-        gain = own / (own + other)
-        return self.error + gain[:, None] * (error - self.error), own * (1 - gain)
+        by_keyframes = self._variances(errors)
+        gain = by_keyframes / (by_keyframes + errors.slow_variance(claimed, self.unlike))
+        return self.error + gain[:, None] * (error - self.error), by_keyframes * (1 - gain)
 
     def _variances(self, errors: ErrorModel) -> Array:
         return errors.variance(self.variance, self.outward, self.unlike)
 
-    def _surprise(self, error: Array, variance: Array) -> float:
-        """Negative log-likelihood of errors (M, 2) with variances (M,) along each axis."""
-        squares = (error**2).sum(1) / variance
-        return float(self.weight @ (surprise(squares, 2) + np.log(variance)))
+    def _likeliest(
+        self,
+        start: ErrorModel,
+        least: dict[str, float],
+        errors_of: Callable[[ErrorModel], tuple[Array, Array]],
+    ) -> ErrorModel:
+        """The parameters named in `least`, where their least values are, that maximize the
+        likelihood of errors (M, 2) m with variances (M,) m^2, which depend on the parameters.
+        """
+        from scipy.optimize import minimize  # for training alone
 
+        def model(logarithms: Array) -> ErrorModel:
+            return replace(start, **dict(zip(least, np.exp(logarithms).tolist(), strict=True)))
 
-def _likeliest(
-    cost: Callable[..., float], start: tuple[float, ...], least: tuple[float, ...] | None = None
-) -> tuple[float, ...]:
-    """The parameters of least cost, of so much at `least`."""
-    from scipy.optimize import minimize  # for training alone
+        def cost(logarithms: Array) -> float:
+            error, variance = errors_of(model(logarithms))
+            squares = (error**2).sum(1) / variance
+            return float(self.weight @ (surprise(squares, 2) + np.log(variance)))
 
-    lowest = np.log(least or (LEAST_STD,) * len(start))
-    found = minimize(
-        lambda logarithms: cost(*np.exp(logarithms)),
-        np.log(start),
-        method='Nelder-Mead',
-        bounds=[(low, -math.log(LEAST_STD)) for low in lowest],
-    )
-    return tuple(np.exp(found.x).tolist())
+        bounds = [(math.log(low), -math.log(LEAST_STD)) for low in least.values()]
+        begin = [math.log(getattr(start, name)) for name in least]
+        return model(minimize(cost, begin, method='Nelder-Mead', bounds=bounds).x)

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drives over uneven ground, leveled before anything is learned from them.
 
-Two images of one place show how much one robot was tilted more than the other, with their
-headings turned to each other. No image says what is level; but all together, each is level as
-surely as one such pair is right: the tilts t_i, roll + j pitch in rad, minimize
+Two images of one place, turned to one heading, show the difference of their tilts. No image says
+what is level; but all together, each is level as surely as one such pair is right: the tilts t_i,
+roll + j pitch in rad, minimize
 
     sum_ij |t_i - exp(j a_ij) t_j - r_ij|^2 + sum_i |t_i|^2
 
@@ -17,23 +17,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
 from sfa_localization.camera.leveling import TILTED_RAD, LeveledPanoramas
-from sfa_localization.data.geometry import Complex
+from sfa_localization.data.geometry import Complex, Indices
 from sfa_localization.data.run import Run
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.keyframes.closures import LIKE, SAMPLES, STRETCH_M, Views, views_of
-from sfa_localization.keyframes.correlation import coarse, coarse_scores, correlate
-from sfa_localization.keyframes.texture import channels, spectra_of
+from sfa_localization.keyframes.closures import LIKE, SAMPLES, ImageSearch, Textures, views_of
+from sfa_localization.keyframes.texture import channels
 from sfa_localization.keyframes.tilt import find_tilt
 
-_LIKEST = 24
-"""Images that each is compared with; of 12 half as much of the tilt is found."""
 _PASSES = 3
-"""Each finds three quarters of what is left."""
+"""Each pass finds three quarters of the remaining tilt."""
 
 
 def leveled_runs(
@@ -44,74 +40,67 @@ def leveled_runs(
     """The runs with leveled panoramas; unchanged where most images are as tilted as those they are
     likest. Of many images each set of `SAMPLES`, from all over the drives, is leveled by itself.
     """
-    count = sum(len(run.panoramas) for run in runs)
-    sets = -(-count // SAMPLES)
-    tilts, level = np.zeros(count, complex), tuple(runs)
-    for one in range(sets):
-        rows = np.arange(one, count, sets)
+    counts = [len(run.panoramas) for run in runs]
+    sets = -(-sum(counts) // SAMPLES)
+    tilts, level = np.zeros(sum(counts), complex), tuple(runs)
+    for start in range(sets):
+        rows = np.arange(start, len(tilts), sets)
         for _ in range(_PASSES):
-            links = links_between(views_of(level, on_images, rows), sphere)
-            if links.usual < TILTED_RAD / 2:
+            pairs = tilt_pairs(views_of(level, on_images, rows), sphere)
+            if pairs.median < TILTED_RAD / 2:
                 break
-            tilts[rows] = links.tilts(tilts[rows])
-            level = _without(runs, tilts, sphere)
+            tilts[rows] = pairs.tilts(tilts[rows])
+            of_runs = np.split(np.column_stack([tilts.real, tilts.imag]), np.cumsum(counts)[:-1])
+            level = tuple(
+                replace(run, panoramas=LeveledPanoramas(run.panoramas, tilt, sphere))
+                for run, tilt in zip(runs, of_runs, strict=True)
+            )
     return level
 
 
-def _without(runs: Sequence[Run], tilts: Complex, sphere: Sphere) -> tuple[Run, ...]:
-    starts = np.cumsum([len(run.panoramas) for run in runs])[:-1]
-    pairs = zip(runs, np.split(np.column_stack([tilts.real, tilts.imag]), starts), strict=True)
-    return tuple(
-        replace(run, panoramas=LeveledPanoramas(run.panoramas, own, sphere)) for run, own in pairs
-    )
-
-
 @dataclass(frozen=True, slots=True)
-class Links:
-    """L pairs of images: rows `first` and `second` (L,), the tilt `found` (L,) of the first against
-    the second, roll + j pitch rad at the heading of the first, and the `turn` (L,) exp(j a) to it
-    from that of the second, which differs by a.
+class TiltPairs:
+    """L pairs of images: rows `first` and `second` (L,), the `tilt` (L,) of the first against the
+    second, roll + j pitch rad at the heading of the first, and the `turn` (L,) exp(j a) to it from
+    that of the second, which differs by a.
     """
 
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
-    found: Complex
+    first: Indices
+    second: Indices
+    tilt: Complex
     turn: Complex
 
     @property
-    def usual(self) -> float:
-        """How much, rad, one image is tilted more than another, half of the time; 0 without any."""
-        return float(np.median(np.abs(self.found))) if len(self.found) else 0.0
+    def median(self) -> float:
+        """Median of the tilts of one image against another, rad; 0 without any pair."""
+        return float(np.median(np.abs(self.tilt))) if len(self.tilt) else 0.0
 
-    def tilts(self, known: Complex) -> Complex:
-        """The tilts (S,) of images from which `known` ones (S,) were taken out already."""
-        count, rows = len(known), np.arange(len(self.found))
+    def tilts(self, removed: Complex) -> Complex:
+        """The tilts (S,) of images from which tilts (S,) were `removed` already."""
+        count, rows = len(removed), np.arange(len(self.tilt))
         shape = len(rows), count
-        one = sparse.csr_matrix((np.ones(len(rows)), (rows, self.first)), shape)
-        apart = one - sparse.csr_matrix((self.turn, (rows, self.second)), shape)
-        squares = (apart.conj().T @ apart + sparse.identity(count)).tocsc()
-        return np.asarray(spsolve(squares, apart.conj().T @ (self.found + apart @ known)))
+        difference = sparse.csr_matrix((np.ones(len(rows)), (rows, self.first)), shape)
+        difference = difference - sparse.csr_matrix((self.turn, (rows, self.second)), shape)
+        squares = (difference.conj().T @ difference + sparse.identity(count)).tocsc()
+        right = difference.conj().T @ (self.tilt + difference @ removed)
+        return np.asarray(spsolve(squares, right))
 
 
-def links_between(views: Views, sphere: Sphere) -> Links:
-    """Each image and those that it is likest, along other stretches of driving."""
-    spectra, columns = spectra_of(views.textures), views.textures.shape[2]
-    rough, parts = coarse(spectra), channels(views.textures.shape[1])
-    found = [np.zeros((0, 5))]
-    for row, image in enumerate(spectra):
-        scores = coarse_scores(image[None], rough)[0]
-        near = np.abs(views.path_m - views.path_m[row]) < STRETCH_M
-        scores[near & (views.run == views.run[row])] = -np.inf
-        likely = np.argsort(-scores, kind='stable')[:_LIKEST]
-        likely = likely[np.isfinite(scores[likely])]
-        if not len(likely):
+def tilt_pairs(views: Textures, sphere: Sphere) -> TiltPairs:
+    """Pairs of each image and those that it is likest, along other stretches of driving."""
+    search, rows = ImageSearch(views), np.arange(len(views.images))
+    _, height, columns = views.textures.shape
+    pairs = [np.zeros((0, 5))]
+    for row in rows.tolist():
+        others = search.candidates(row, rows)
+        if not len(others):
             continue
-        shifts = correlate(image[None], spectra[likely], columns)[1][0]
-        turn = np.asarray(shifts, float) * (2 * np.pi / columns)
-        tilts, alike = find_tilt(image, spectra[likely], turn, columns, parts, sphere)
+        turn = search.correlate(row, others)[1] * (2 * np.pi / columns)
+        of_others = search.spectra[others], turn, columns, channels(height), sphere
+        tilts, scores = find_tilt(search.spectra[row], *of_others)
         heading = turn if sphere.clockwise else -turn
-        both = np.column_stack([np.full(len(likely), row), likely, tilts, heading])
-        found.append(both[alike >= LIKE])
-    first, second, roll, pitch, heading = np.concatenate(found).T
-    rows = first.astype(np.int64), second.astype(np.int64)
-    return Links(*rows, roll + 1j * pitch, np.exp(1j * heading))
+        pair = np.column_stack([np.full(len(others), row), others, tilts, heading])
+        pairs.append(pair[scores >= LIKE])
+    first, second, roll, pitch, heading = np.concatenate(pairs).T
+    indices = first.astype(np.int64), second.astype(np.int64)
+    return TiltPairs(*indices, roll + 1j * pitch, np.exp(1j * heading))

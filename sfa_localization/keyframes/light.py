@@ -1,11 +1,11 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The conditions of late: what the light adds to all images, and how wrong slow features are in it.
+"""Conditions of the latest images: what the light adds to them, and how wrong slow features are.
 
 The sun shines on the same sides of all things, so that much of what it adds to an image is a
-pattern over the directions, the same wherever the robot is. What no place explains of the images,
-averaged over many places, is that pattern: without it, images of another light lie where those of
-the training did; with it, all are moved alike, by what of it looks like another place.
+pattern over the directions, the same wherever the robot is. The residual of images, averaged over
+many places, is that pattern. Without the pattern, images of another light lie where those of the
+training did; with it, all are moved alike, because it resembles a change of place.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from sfa_localization.keyframes.location import SCALES, Location
 from sfa_localization.keyframes.regression import BORDER
 from sfa_localization.keyframes.texture import Spectra
 
-# Places over which the pattern is averaged, about ten meters of driving; as many as how many its
-# absence counts at the start; and how far they are apart, m: a robot that stands learns nothing.
+# Places over which the pattern is averaged, about ten meters of driving; the weight, in places, of
+# no pattern at the start; and their spacing, m: a robot that stands learns nothing.
 _AVERAGED, _BEFORE, _SPACING_M = 40, 10, 0.25
-# Share of the newest image in the probabilities of scales, which are those of about ten images.
+# Share of the newest image in the probabilities of scales: they follow about ten images.
 _NEWEST = 0.1
 
 
 class Conditions:
     """`pattern` (rows, F) is the spectrum of what the light adds to the texture of an image with
-    yaw 0, None before any is known; `scales` (S,) are the probabilities of `SCALES`.
+    yaw 0, None before the first image; `scales` (S,) are the probabilities of `SCALES`.
     """
 
     def __init__(self) -> None:
@@ -35,18 +35,18 @@ class Conditions:
 
     @property
     def slow_error_factor(self) -> float:
-        """How many times as large as in training the errors of slow features are, about."""
+        """About the ratio of the errors of slow features to those in training."""
         return float(np.exp(self.scales @ np.log(SCALES) / 2))
 
     def add(self, location: Location) -> None:
-        """Learn from an image of a known place, located with these conditions."""
+        """Learn from an image that was located with these conditions."""
         self.scales = self.scales + _NEWEST * (location.scales - self.scales)
         place, fit = location.pose[:2], location.fit
-        # At the border, what no place explains is no matter of the light.
+        # At the border of the keyframes, the residual also comes of the place.
         if fit.outward > BORDER or np.hypot(*(place - self._last)) < _SPACING_M:
             return
         self._places, self._last = self._places + 1, place
         share = np.float32(1 / min(self._places + _BEFORE, _AVERAGED))
         before = np.zeros_like(fit.residual) if self.pattern is None else self.pattern
-        # The residual is that of an image without the pattern known so far.
+        # The pattern so far was subtracted from the image before the fit.
         self.pattern = before + share * fit.residual

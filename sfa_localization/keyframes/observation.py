@@ -13,20 +13,20 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.rig import UNKNOWN_YAW_STD
 
 UNKNOWN_YAW_VARIANCE = UNKNOWN_YAW_STD**2
-"""rad^2, of an angle of which nothing is known."""
+"""rad^2, of an unknown angle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What one image shows: `pose` (3,) [x m, y m, yaw rad] in the map and its `covariance` (3, 3).
+    """What one image shows: `pose` (3,) [x m, y m, yaw rad] in the map and its `covariance` (3, 3),
+    in which an unknown yaw has UNKNOWN_YAW_VARIANCE.
 
-    Of an unknown yaw the variance is UNKNOWN_YAW_VARIANCE. `slow_features` (K,); `explained` is the
-    part of the image that its place explains, 0 to 1: of foreign images 0.1, 0.28 at most.
-    `problem` is why the image at `stamp_ns` is unusable, '' where it is usable: the covariance then
-    means that nothing is known. `turned` is the heading (rad, from any start) that the shifts
-    between the images of a drive add up to, NaN for an unusable one: it needs no map, and shows the
-    camera's delay. `tilt` (2,) rad is the roll and pitch of the robot, against those of the
-    training.
+    `explained` is the part of the image that its place explains, 0 to 1: of foreign images 0.1,
+    0.28 at most. `problem` says why the image at `stamp_ns` is unusable, '' where it is usable: the
+    covariance of an unusable one means that nothing is known. `turned` is the heading (rad, from
+    any start) by the shifts between successive images, NaN for an unusable one: it needs no map,
+    and shows the camera's delay. `tilt` (2,) rad is the roll and pitch of the robot, relative to
+    the training.
     """
 
     pose: Array
@@ -51,5 +51,5 @@ class Observation:
     @property
     def finite(self) -> bool:
         """Whether all of its numbers are."""
-        known = (self.slow_features, self.pose, self.covariance)
-        return all(bool(np.isfinite(part).all()) for part in known)
+        parts = self.slow_features, self.pose, self.covariance
+        return all(bool(np.isfinite(part).all()) for part in parts)

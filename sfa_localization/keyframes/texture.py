@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Textures: what is left of a panorama after its light, small, and as the spectra of its columns.
+"""Textures: small panoramas of local contrast, and their spectra over the columns.
 
 Local contrast survives another light and season. Brightness also shows the sunlit side of things,
 and seems to move them with the sun; their colors stay.
@@ -21,21 +21,20 @@ Texture = NDArray[np.float32]
 Spectra = NDArray[np.complex64]
 
 _COLUMNS, _ROWS, _COLOR_ROWS = 80, 16, 8
-# Standard deviation of the blur that takes light and its slow changes out, of the columns: 10 deg.
+# Standard deviation of the blur that removes light and its slow changes, of the columns: 10 deg.
 _BLUR = 1 / 37.5
-# Keeps the noise of dark and of plain surfaces small beside texture: of the brightness (8 bit),
-# and of its logarithm.
+# Added to the brightness (8 bit) and to the standard deviation of its logarithm: the noise of dark
+# and of plain surfaces stays small beside texture.
 _DARKEST, _FLATTEST = 8.0, 0.1
-# Textures have one byte a number: so many steps are a standard deviation.
+# Textures have one byte a number: so many steps make a standard deviation.
 _STEPS = 127 / 4.0
 
 
 def texture(panorama: Image) -> Texture:
     """Local contrast of a panorama (H, W, 3) uint8, small: (rows, columns), zero mean, unit norm.
 
-    The logarithm of the brightness minus its surroundings, over their standard deviation: what is
-    left of an image after its light. Below it, in half as many rows, the same of red over green
-    and of blue over both; a gray camera has none.
+    The logarithm of the brightness minus its surroundings, over their standard deviation. Below it,
+    in half as many rows, the same of red over green and of blue over both; a gray camera has none.
     """
     small = _small(panorama, _ROWS, _COLUMNS)
     few = _small(small, _COLOR_ROWS, _COLUMNS)
@@ -50,8 +49,8 @@ def _logarithm(image: Texture) -> Texture:
 
 
 def _contrast(values: Texture) -> Texture:
-    """Of channels (rows, columns, C): their values minus the surroundings, over their standard
-    deviation there, (C, rows, columns).
+    """Channels (rows, columns, C) minus their surroundings, over the standard deviation of these:
+    (C, rows, columns).
     """
     width = values.shape[1]
     margin = max(width // 6, 1)
@@ -80,7 +79,7 @@ def spectrum(textures: Texture) -> Spectra:
 
 
 def channels(rows: int) -> tuple[slice, ...]:
-    """Of a texture's rows those of brightness and of both color differences."""
+    """The rows of brightness, and of both color differences, in a texture of so many rows."""
     few = min(rows // 3, _COLOR_ROWS)
     light = rows - 2 * few
     return slice(0, light), slice(light, light + few), slice(light + few, rows)
@@ -105,6 +104,6 @@ def turned(spectra: Spectra, angle: Array | float) -> Spectra:
     return np.asarray(spectra * phase[..., None, :])
 
 
-def columns_of(spectra: Spectra, columns: int, axis: int = -1) -> Texture:
-    """So many columns of what has these spectra. (SciPy would take as long to import as NumPy.)"""
-    return np.asarray(np.fft.irfft(spectra, columns, axis), np.float32)
+def columns_of(spectra: Spectra, columns: int) -> Texture:
+    """Textures (..., rows, columns) of spectra (..., rows, F). (SciPy takes too long to import.)"""
+    return np.asarray(np.fft.irfft(spectra, columns), np.float32)

@@ -14,8 +14,6 @@ by a sine of its azimuth.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,42 +24,33 @@ from sfa_localization.data.statistics import parabola_peak
 from sfa_localization.keyframes.texture import Spectra, Texture, columns_of, turned
 
 _LARGEST = np.radians(12.0)
-"""Of the tilts that are tried, along each axis."""
+"""The largest tilt that is tried along each axis."""
 _UNLIKELY = 0.01 / np.radians(4.0) ** 2
-"""What a correlation with a tilt counts less, per squared rad: few tilts are above 4 degrees."""
+"""The correlation is reduced by this, times the square of the tilt in rad: few tilts are above 4
+degrees."""
 
 
 def visible(tilt: Array, rows: int, columns: int, sphere: Sphere) -> NDArray[np.bool_]:
-    """Where a panorama (rows, columns) that was `leveled` shows what the tilted one did."""
+    """Where a `leveled` panorama (rows, columns) shows what the camera saw."""
     up = sphere.rays(rows, columns) @ rotation(*tilt)[:, 2]
     return np.asarray((up > np.sin(sphere.low)) & (up < np.sin(sphere.high)))
 
 
 def derivatives(texture: Texture, channels: Sequence[slice], sphere: Sphere) -> Texture:
-    """Of a panorama (rows, columns) by roll and pitch: (2, rows, columns) per rad; `channels` are
-    rows of one panorama each.
+    """Derivatives of a texture (rows, columns) by roll and pitch, (2, rows, columns) per rad;
+    each of the `channels`, which are rows, is a panorama.
     """
-    heights = tuple(part.stop - part.start for part in channels)
-    upward, sideways, sin, cos = _slopes(sphere, heights, texture.shape[1])
-    up, left = upward @ texture, np.roll(texture, -1, 1) - np.roll(texture, 1, 1)
-    left *= sideways
-    return np.stack([up * sin - left * cos, -left * sin - up * cos])
-
-
-@lru_cache(maxsize=8)
-def _slopes(sphere: Sphere, heights: tuple[int, ...], columns: int) -> tuple[Texture, ...]:
-    """What makes of textures their derivatives along which a tilt moves them up, (rows, rows), and
-    of two columns' differences those sideways, (rows, 1); sine and cosine of azimuths (columns,).
-    """
-    upward = np.zeros((sum(heights), sum(heights)))
-    for end, rows in zip(np.cumsum(heights), heights, strict=True):
-        part, row = slice(end - rows, end), (sphere.low - sphere.high) / rows
-        upward[part, part] = np.gradient(np.eye(rows), row, axis=0)
-    elevations = np.concatenate([sphere.elevations(rows) for rows in heights])
-    azimuth, sign = sphere.azimuths(columns), -1 if sphere.clockwise else 1
-    sideways = np.tan(elevations)[:, None] * (sign * columns / (4 * np.pi))
-    slopes = upward, sideways, np.sin(azimuth), np.cos(azimuth)
-    return tuple(np.asarray(one, np.float32) for one in slopes)
+    columns, upward, elevations = texture.shape[1], [], []
+    for part in channels:
+        elevations.append(sphere.elevations(part.stop - part.start))
+        step = (sphere.low - sphere.high) / len(elevations[-1])
+        upward.append(np.gradient(texture[part], step, axis=0))
+    sideways = np.roll(texture, -1, 1) - np.roll(texture, 1, 1)
+    sideways = sideways * np.tan(np.concatenate(elevations))[:, None]
+    sideways *= (-1 if sphere.clockwise else 1) * columns / (4 * np.pi)
+    azimuth, up = sphere.azimuths(columns), np.concatenate(upward)
+    sin, cos = np.sin(azimuth), np.cos(azimuth)
+    return np.stack([up * sin - sideways * cos, -sideways * sin - up * cos])
 
 
 def find_tilt(
@@ -72,80 +61,42 @@ def find_tilt(
     channels: Sequence[slice],
     sphere: Sphere,
 ) -> tuple[Array, Array]:
-    """Roll and pitch rad with which a texture is likest each of M level ones, by the spectra of
-    their columns, (rows, F) and (M, rows, F), of its heading when `turned` by `turn` (M,) rad: the
-    tilts (M, 2), and the correlations (M,), less for large tilts. `channels` are rows of one
-    panorama each, of the first one the most.
+    """Roll and pitch (M, 2) rad with which a texture is likest each of M level ones, and the
+    correlations (M,), reduced for large tilts.
 
-    All tilts up to 12 degrees in steps of one row are tried: each column is correlated with shifted
-    ones of the others once, and the correlation by a tilt is a sum of these over the columns. Every
-    second column will do: a tilt is the same in all.
+    The textures are given by the spectra of their columns, (rows, F) and (M, rows, F); the others
+    have the heading of the image when `turned` by `turn` (M,) rad. `channels` are rows of one
+    panorama each, of the first one the most. All tilts up to 12 degrees in steps of one row are
+    tried: the correlation of an image with a tilt is a sum over the columns, each moved up or down.
     """
-    tried = _Tilts.of(sphere, tuple(part.stop - part.start for part in channels), columns)
-    few = tried.columns // 2 + 1
-    others = turned(others[..., :few], turn)
-    level = columns_of(others.swapaxes(1, 2), tried.columns, axis=1)
-    shifted = columns_of(image[:, :few], tried.columns).T @ tried.shifts
-    by_shift = level.swapaxes(0, 1) @ shifted.reshape(*level.shape[1:], -1)
-    scores = by_shift.swapaxes(0, 1).reshape(len(others), -1) @ tried.weights
-    count = len(tried.steps)
-    square = scores.reshape(len(others), count, count) - tried.unlikely
-    return _peaks(square, tried.steps), square.max((1, 2))
+    rows, count = channels[0].stop, len(others)
+    # Rows of a channel with fewer of them are as many finer ones.
+    fine = [part.start + np.arange(rows) * (part.stop - part.start) // rows for part in channels]
+    level = columns_of(turned(others, turn)[:, np.stack(fine)], columns)
+    row_rad = (sphere.high - sphere.low) / rows
+    most = max(min(round(float(_LARGEST) / row_rad), rows // 2 - 1), 1)
+    steps = np.arange(-most, most + 1)
+    padded = np.pad(columns_of(image[np.stack(fine)], columns), ((0, 0), (most, most), (0, 0)))
+    by_step = np.empty((count, columns, len(steps)), np.float32)
+    for k, step in enumerate(steps.tolist()):
+        moved = padded[:, most - step : most - step + rows]
+        overlap = np.sqrt(rows / (rows - abs(step)))
+        by_step[:, :, k] = overlap * np.einsum('mhrc,hrc->mc', level, moved)
+    azimuth = sphere.azimuths(columns)[:, None, None]
+    shift = np.clip(steps * np.cos(azimuth) - steps[:, None] * np.sin(azimuth), -most, most)
+    # Linear between two whole rows: (columns, steps, rolls, pitches).
+    weights = np.maximum(1 - np.abs(shift[:, None] - steps[:, None, None]), 0)
+    scores = np.tensordot(by_step, weights.astype(np.float32), 2)
+    scores -= (_UNLIKELY * row_rad**2 * np.add.outer(steps**2, steps**2)).astype(np.float32)
+    return row_rad * (_peaks(scores) - most), scores.max((1, 2))
 
 
-@dataclass(frozen=True, slots=True)
-class _Tilts:
-    """Rolls, and pitches, `steps` (S,) rad that are tried, of textures with so many `columns` left.
-
-    `shifts` (rows, rows * S) are what makes of one column all of its shifts, so that correlations
-    are those of all columns, and all rows; `weights` (columns * S, S * S) what shifts of columns
-    each tilt makes; and how much `unlikely` (S, S) tilts are.
-    """
-
-    steps: Array
-    columns: int
-    shifts: Texture
-    weights: Texture
-    unlikely: Texture
-
-    @classmethod
-    @lru_cache(maxsize=4)
-    def of(cls, sphere: Sphere, heights: tuple[int, ...], columns: int) -> _Tilts:
-        rows, few = heights[0], columns // 2
-        row = (sphere.high - sphere.low) / rows
-        count = max(min(round(_LARGEST / row), rows // 2 - 1), 1)
-        shifts = np.arange(-count, count + 1)
-        first = sphere.azimuths(columns)[0] - sphere.azimuths(few)[0]
-        azimuth = (sphere.azimuths(few) + first)[:, None, None]
-        shift = shifts * np.cos(azimuth) - shifts[:, None] * np.sin(azimuth)
-        # Of each column, between two whole rows.
-        near = np.maximum(
-            1 - np.abs(np.clip(shift, -count, count)[:, None] - shifts[:, None, None]), 0
-        )
-        steps = row * shifts
-        unlikely = _UNLIKELY * np.add.outer(steps**2, steps**2)
-        # Of half as many columns, spectra make values twice as large.
-        scale = np.sqrt(rows / (rows - np.abs(shifts))) * few / columns
-        moved = np.zeros((sum(heights), sum(heights), len(shifts)))
-        for end, n in zip(np.cumsum(heights), heights, strict=True):
-            # Rows of a texture with fewer of them are as many finer ones.
-            fine = np.arange(n) == (np.arange(rows) * n // rows)[:, None]
-            by_shift = [fine.T @ np.eye(rows, k=k) @ fine for k in shifts.tolist()]
-            moved[end - n : end, end - n : end] = np.stack(by_shift, axis=2)
-        weights = near.reshape(few * len(shifts), -1)
-        tables = (moved * scale).reshape(len(moved), -1), weights, unlikely
-        return cls(steps, few, *(np.asarray(one, np.float32) for one in tables))
-
-
-def _peaks(scores: Texture, steps: Array) -> Array:
-    """Where each of M squares (M, S, S) over rolls and pitches is largest, between the steps."""
+def _peaks(scores: Texture) -> Array:
+    """Indices (M, 2), with a fraction, at which M squares (M, S, S) are largest."""
     inner = scores[:, 1:-1, 1:-1].reshape(len(scores), -1).argmax(1)
-    roll, pitch = (at + 1 for at in np.divmod(inner, len(steps) - 2))
-    which = np.arange(len(scores))
-    found = []
-    for at, ahead in ((roll, (1, 0)), (pitch, (0, 1))):
-        before = scores[which, roll - ahead[0], pitch - ahead[1]]
-        after = scores[which, roll + ahead[0], pitch + ahead[1]]
-        part = parabola_peak(before, scores[which, roll, pitch], after)
-        found.append(steps[at] + part * (steps[1] - steps[0]))
-    return np.column_stack(found)
+    roll, pitch = (at + 1 for at in np.divmod(inner, scores.shape[2] - 2))
+    m = np.arange(len(scores))
+    top = scores[m, roll, pitch]
+    by_roll = parabola_peak(scores[m, roll - 1, pitch], top, scores[m, roll + 1, pitch])
+    by_pitch = parabola_peak(scores[m, roll, pitch - 1], top, scores[m, roll, pitch + 1])
+    return np.column_stack([roll + by_roll, pitch + by_pitch]).astype(float)

@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,25 +12,24 @@ from numpy.typing import NDArray
 from sfa_localization.camera.leveling import TILTED_RAD, leveled
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.run import Image
-from sfa_localization.keyframes.correlation import LIKE_A_PLACE, coarse_scores, least
+from sfa_localization.keyframes.correlation import LIKE_A_PLACE, coarse_scores
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.texture import Spectra, spectrum, texture
 from sfa_localization.keyframes.tilt import find_tilt, visible
 
-# How many keyframes the coarse correlation leaves for the full one.
+# The coarse correlation leaves so many keyframes for the full one.
 _CANDIDATES = 64
-# The likest keyframes to which an image is leveled: with a tilt the first may be another place.
+# An image is leveled to so many likest keyframes: with a tilt the first may be of another place.
 _LEVELED = 16
-# Tilts that are tried for an image that is unlike all keyframes: beyond 8 degrees it is, even of a
-# known place, and each of these makes it like them up to 6 degrees on.
-_STEEP_RAD = math.radians(8.0) * np.array(
-    [(math.cos(angle), math.sin(angle)) for angle in np.arange(8) * math.pi / 4]
-)
+# Tilts that are tried for an image that is unlike all keyframes: beyond 8 degrees even one of a
+# known place is, and each of these tilts makes it like them up to 6 degrees farther.
+_EIGHTHS = np.arange(8) * np.pi / 4
+_STEEP_RAD = np.radians(8.0) * np.column_stack([np.cos(_EIGHTHS), np.sin(_EIGHTHS)])
 
 
 @dataclass(frozen=True, slots=True)
 class UprightImage:
-    """The `panorama` (H, W, 3) that a level robot would see, by the one that was `seen` with a
+    """The `panorama` (H, W, 3) that a level robot would see, made of the one that was `seen` with a
     `tilt`, roll and pitch (2,) rad.
 
     `spectrum` (rows, F) is that of its texture, `visible` that of the part that was seen, scaled so
@@ -66,52 +64,45 @@ def upright(keyframes: Keyframes, panorama: Image) -> UprightImage:
 
 
 def without(keyframes: Keyframes, image: UprightImage, tilt: Array) -> UprightImage:
-    """An image after a roll and pitch (2,) rad more are taken out, if they matter; the same
-    keyframes are correlated.
+    """An image after a further roll and pitch (2,) rad are taken out, if they matter; it is
+    correlated with the same keyframes.
     """
     if np.hypot(*tilt) < TILTED_RAD:
         return image
-    level = _seen(keyframes, image.seen, image.tilt + tilt)
-    return correlated(keyframes, level, np.flatnonzero(np.isfinite(image.scores)))
+    rows = np.flatnonzero(np.isfinite(image.scores))
+    return _compared(keyframes, image.seen, image.tilt + tilt, rows)
 
 
-def correlated(keyframes: Keyframes, image: UprightImage, rows: Indices) -> UprightImage:
-    """An image with the correlations of some keyframes more."""
-    rows = rows[np.isneginf(image.scores[rows])]
-    scores, yaws = image.scores.copy(), image.yaws.copy()
-    scores[rows], yaws[rows] = (of[0] for of in keyframes.correlated(image.visible[None], rows))
-    return replace(image, scores=scores, yaws=yaws)
-
-
-def _seen(keyframes: Keyframes, panorama: Image, tilt: Array) -> UprightImage:
-    """A panorama (H, W, 3) that was taken with a tilt (2,) rad, compared with no keyframe."""
-    if not tilt.any():
-        whole = spectrum(texture(panorama))
-        return UprightImage(panorama, panorama, tilt, whole, whole, *keyframes.unmatched())
-    sphere, columns = keyframes.sphere, keyframes.columns
-    level = leveled(panorama, tilt, sphere)
+def _compared(
+    keyframes: Keyframes, panorama: Image, tilt: Array, rows: Indices | None = None
+) -> UprightImage:
+    """A panorama (H, W, 3) that was taken with a tilt (2,) rad, correlated with some keyframes, by
+    default with those that it is likest.
+    """
+    level = leveled(panorama, tilt, keyframes.sphere) if tilt.any() else panorama
     image = texture(level)
-    rows = [part.stop - part.start for part in keyframes.channels]
-    mask = np.concatenate([visible(tilt, n, columns, sphere) for n in rows])
-    part = image * mask
-    # What was not seen would count as unlike.
-    part /= np.float32(max(float(np.linalg.norm(part)), 1e-6) * math.sqrt(mask.mean()))
-    spectra = spectrum(image), spectrum(part)
-    return UprightImage(panorama, level, tilt, *spectra, *keyframes.unmatched())
-
-
-def _compared(keyframes: Keyframes, panorama: Image, tilt: Array) -> UprightImage:
-    """The same, correlated with the keyframes that it is likest."""
-    image = _seen(keyframes, panorama, tilt)
-    scores = coarse_scores(image.visible[None], keyframes.coarse)[0]
-    return correlated(keyframes, image, np.sort(least(-scores, _CANDIDATES)))
+    whole = part = spectrum(image)
+    if tilt.any():
+        heights = [channel.stop - channel.start for channel in keyframes.channels]
+        masks = [visible(tilt, n, keyframes.columns, keyframes.sphere) for n in heights]
+        mask = np.concatenate(masks)
+        seen = image * mask
+        # What was not seen would count as unlike.
+        seen /= max(float(np.linalg.norm(seen)), 1e-6) * np.sqrt(mask.mean())
+        part = spectrum(seen)
+    if rows is None:
+        order = np.argsort(-coarse_scores(part, keyframes.coarse), kind='stable')
+        rows = np.sort(order[:_CANDIDATES])
+    scores, yaws = np.full((2, len(keyframes.poses)), -np.inf, np.float32)
+    scores[rows], yaws[rows] = keyframes.correlated(part, rows)
+    return UprightImage(panorama, level, tilt, whole, part, scores, yaws)
 
 
 def _leveled(keyframes: Keyframes, image: UprightImage) -> UprightImage:
     """An image without the tilt that it has against one of its likest keyframes."""
-    likely = np.flatnonzero(np.isfinite(image.scores))
-    likely = likely[least(-image.scores[likely], _LEVELED)]
-    level, turn = keyframes.aligned(likely), -keyframes.sign * image.yaws[likely]
-    others = level, turn.astype(float), keyframes.columns, keyframes.channels, keyframes.sphere
-    tilts, scores = find_tilt(image.spectrum, *others)
+    likest = np.argsort(-image.scores, kind='stable')[:_LEVELED]
+    likest = likest[np.isfinite(image.scores[likest])]
+    turn = -keyframes.sign * image.yaws[likest].astype(float)
+    of_keyframes = keyframes.columns, keyframes.channels, keyframes.sphere
+    tilts, scores = find_tilt(image.spectrum, keyframes.aligned(likest), turn, *of_keyframes)
     return without(keyframes, image, tilts[int(scores.argmax())])

@@ -19,7 +19,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import Points, Run, Stamps
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.keyframes.closures import Closures, Views
+from sfa_localization.keyframes.closures import Closures, Textures
 from sfa_localization.keyframes.offsets import Offsets, find_offsets
 from sfa_localization.keyframes.turning import lever_square
 from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
@@ -123,7 +123,7 @@ class Drives:
         yaw = self.mount.of(len(self.items)).yaw
         return np.repeat(yaw, [len(drive.run.panoramas) for drive in self.items])
 
-    def measured(self, views: Views, sphere: Sphere) -> Drives:
+    def measured(self, views: Textures, sphere: Sphere) -> Drives:
         """With the offsets of `views`, near the poses of the graph of odometry and closures, and
         the camera's place on the robot, which both determine together."""
         headings = self._headings(self.tracks())

@@ -13,10 +13,10 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.data.statistics import share_within
-from sfa_localization.keyframes.closures import Views
+from sfa_localization.keyframes.closures import Textures
 from sfa_localization.keyframes.errors import ErrorModel, LeftOut
 from sfa_localization.keyframes.keyframes import Keyframes
-from sfa_localization.keyframes.training import choose_keyframes, located_without, spread
+from sfa_localization.keyframes.training import choose_keyframes, located_without
 from sfa_localization.metric.forecast import ground_distances, importance
 from sfa_localization.metric.learning import MetricResult
 from sfa_localization.metric.segments import Segments, assignment
@@ -51,15 +51,14 @@ class KeyframeMap:
 
 
 def learn_keyframes(
-    views: Views, segments: Segments, result: MetricResult, sphere: Sphere, turn_radius_m: float
+    views: Textures, segments: Segments, result: MetricResult, sphere: Sphere, turn_radius_m: float
 ) -> KeyframeMap:
     """Keyframes where the certified solution puts the images of `views`; along the drive a turn
     counts as `turn_radius_m` per rad. Raises DataError for too few.
     """
     _, seen, row = np.intersect1d(views.images, result.images, return_indices=True)
     poses, drives = result.poses[row], views.run[seen].astype(np.int32)
-    keyframes = choose_keyframes(views.textures[seen], poses, sphere, drives)
-    kept = spread(poses)
+    keyframes, kept = choose_keyframes(views.textures[seen], poses, sphere, drives)
     path, rows = _along_tracks(views, segments)[seen][kept], row[kept]
     tried, fits, near_m = located_without(keyframes, path)
     shared = {'map_m': result.map.common_m, 'turn_std': usual_turn_std(result.angle_covariance)}
@@ -97,7 +96,7 @@ def usual_turn_std(covariance: Array) -> float:
     return float(np.sqrt(np.median(np.diag(covariance))))
 
 
-def _along_tracks(views: Views, segments: Segments) -> Array:
+def _along_tracks(views: Textures, segments: Segments) -> Array:
     """Distance (S,) m driven until each image, far apart between drives; of a segment along an
     earlier track it is that of the earlier one."""
     path = views.path_m + _ANOTHER_DRIVE_M * views.run
