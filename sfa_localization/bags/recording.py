@@ -28,7 +28,7 @@ from sfa_localization.bags.files import (
     make_topic,
 )
 from sfa_localization.data.errors import BagError
-from sfa_localization.data.files import is_regular, read_regular, start_of
+from sfa_localization.data.files import first_bytes, read_regular
 from sfa_localization.data.plain_yaml import LONGEST, load_yaml
 from sfa_localization.data.rejections import short_line
 
@@ -92,7 +92,7 @@ class Recording:
         """Names of the files, and the topics that the metadata tell of."""
         if not os.path.exists(self.path):
             raise BagError(f'{short_line(str(self.path))}: no such bag; check the path')
-        if is_regular(self.path):
+        if os.path.isfile(self.path):
             return [self.path.name], []
         if not self.path.is_dir():
             raise BagError(f'{self.path}: is neither a file nor a folder; copy it to a file')
@@ -125,8 +125,6 @@ class Recording:
                 file = self._open_file(path)
                 self._open.callback(file.close)
                 self._files.append(file)
-            except FileNotFoundError:
-                failures.append(f'{path}: is missing; copy all files of the bag')
             except (OSError, ValueError) as error:
                 failures.append(f'{path}: cannot be read: {describe(error)}')
             except BagError as error:
@@ -138,14 +136,16 @@ class Recording:
     def _open_file(self, path: Path) -> StoredFile:
         """Open one file, or a decompressed copy, by its first bytes. Raises OSError or BagError."""
         plain, damage = path, ''
-        if path.exists() and not is_regular(path):
+        if not path.exists():
+            raise BagError(f'{path}: is missing; copy all files of the bag')
+        if not path.is_file():
             raise BagError(f'{path}: is no regular file; copy it to one')
-        if start_of(path, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
+        if first_bytes(path, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
             folder = self._open.enter_context(TemporaryDirectory(prefix='bag-'))
             plain = Path(folder) / path.stem
             if damage := inflate_file(path, plain):
                 self.problems.append(f'{path.name}: {damage}')
-        start = start_of(plain, 16)
+        start = first_bytes(plain, 16)
         if not start:
             raise BagError(f'{path}: holds nothing ({damage or "0 bytes"}); record it again')
         for magic, reader in READERS.items():

@@ -24,7 +24,6 @@ from sfa_localization.camera.encodings import read_image
 from sfa_localization.camera.settings import CaptureConfig
 from sfa_localization.camera.watch import FROZEN_S, FrozenWatch
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.files import is_regular
 from sfa_localization.data.run import Image
 
 logger = logging.getLogger(__name__)
@@ -82,7 +81,7 @@ def _video(config: CaptureConfig) -> Source:
     """A video file, at its own rate or another."""
     path = config.source_path
     # Asked first: a pipe never ends, and of a missing file OpenCV would warn on its own.
-    capture = cv2.VideoCapture(path) if is_regular(path) else None
+    capture = cv2.VideoCapture(path) if os.path.isfile(path) else None
     if capture is None or not capture.isOpened():
         raise CameraError(f'video {path} is missing, or of a kind OpenCV cannot read')
     own = capture.get(cv2.CAP_PROP_FPS)
