@@ -285,7 +285,7 @@ class _Survey:
         if samples:
             ((height, width), _), *_ = self._sizes.most_common(1)
             alike = [sample for sample in samples if sample.shape == samples[0].shape]
-            self._report.camera = kinds.kind_of(alike, width, height)
+            self._report.camera = kinds.CameraKind(*kinds.guess_geometry(alike), width, height)
         for stream in streams:
             if stream.topic == self._driven and self._values[self._driven]:
                 self._drive(stream)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sfa_localization.bags.drives import ReadingRecipe
-from sfa_localization.camera.kinds import require_one_view
+from sfa_localization.camera.kinds import require_single_view
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings, turns_and_textures
 from sfa_localization.data.events import DELAY_LIMIT_NS
@@ -149,7 +149,7 @@ def compared(
     Raises CameraError or DataError for what cannot be right, of which `force` only warns.
     """
     if not force:
-        require_one_view(runs)
+        require_single_view(runs)
     shown = [turns_and_textures(run.panoramas, recipe.panorama.clockwise) for run in runs]
     seen, textures = zip(*shown, strict=True)
     found, checks = check_drives(runs, seen, force, textures)
