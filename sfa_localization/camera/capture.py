@@ -35,7 +35,7 @@ _IDLE_PAUSE_S = 0.02  # of a file while no image is wanted: shorter than a frame
 _REOPEN_FIRST_S, _REOPEN_LONGEST_S = 0.5, 30.0  # pauses before a source is reopened; they double
 
 
-Images = Generator[Image | CameraError, None, None]
+CapturedImages = Generator[Image | CameraError, None, None]
 """Images (H, W, 3) uint8 BGR in order; errors in place of unusable ones."""
 
 
@@ -46,7 +46,7 @@ class Source(NamedTuple):
     """
 
     live: bool
-    images: Images
+    images: CapturedImages
 
 
 def opener(config: CaptureConfig) -> Callable[[], Source]:
@@ -107,7 +107,7 @@ def _read(path: Path) -> Image | CameraError:
         return error
 
 
-def _frames(capture: cv2.VideoCapture, at_end: str = '') -> Images:
+def _frames(capture: cv2.VideoCapture, at_end: str = '') -> CapturedImages:
     """Captured images; the end of them raises CameraError with the text `at_end`, if any."""
     try:
         while True:
@@ -122,7 +122,7 @@ def _frames(capture: cv2.VideoCapture, at_end: str = '') -> Images:
         capture.release()
 
 
-def _paced(images: Iterable[Image | CameraError], rate_hz: float) -> Images:
+def _paced(images: Iterable[Image | CameraError], rate_hz: float) -> CapturedImages:
     """The images at a rate; a reader that is late does not catch up."""
     due = time.monotonic()
     for image in images:

@@ -19,7 +19,7 @@ from numpy.polynomial import Polynomial
 from sfa_localization.camera.settings import UNCALIBRATED, LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.sphere import rotation
+from sfa_localization.data.sphere import Sphere, rotation
 
 _LEAST_AFFINE = 1e-3  # determinant of the affine part: 1 for square pixels, 0 if singular
 _WIDEST_PLANE = 20.0  # radius in the plane of a mirror up to which its distortion is inverted
@@ -141,29 +141,19 @@ class RadialLens:
 
 @dataclass(frozen=True)
 class CylinderLens:
-    """An image linear in azimuth and elevation, axis in its center column.
-
-    `size` is columns and rows, `elevation` that of the lower and upper edge, rad.
+    """An image linear in azimuth and elevation, its axis in the center column; `size` is rows and
+    columns.
     """
 
+    sphere: Sphere
     size: tuple[int, int]
-    elevation: tuple[float, float]
     center: None = None
 
     def project(self, rays: Array) -> Array:
-        azimuth = np.arctan2(rays[:, 0], rays[:, 2])
-        elevation = np.arctan2(-rays[:, 1], np.hypot(rays[:, 0], rays[:, 2]))
-        (width, height), (low, high) = self.size, self.elevation
-        column = (azimuth / (2 * np.pi) + 0.5) * width - 0.5
-        row = (high - elevation) / (high - low) * height - 0.5
-        return np.column_stack([column, row])
+        return self.sphere.pixels(rays @ _AXES['forward'].T, *self.size)
 
     def unproject(self, pixels: Array) -> Array:
-        (width, height), (low, high) = self.size, self.elevation
-        azimuth = ((pixels[:, 0] + 0.5) / width - 0.5) * 2 * np.pi
-        elevation = high - (pixels[:, 1] + 0.5) / height * (high - low)
-        flat = np.cos(elevation)
-        return np.column_stack([flat * np.sin(azimuth), -np.sin(elevation), flat * np.cos(azimuth)])
+        return np.asarray(self.sphere.directions(pixels, *self.size) @ _AXES['forward'])
 
 
 @dataclass(frozen=True)
@@ -284,12 +274,11 @@ def _scale(calibration: LensCalibration, size: tuple[int, int]) -> Array:
 def _make_lens(
     calibration: LensCalibration, size: tuple[int, int], panorama: PanoramaConfig
 ) -> Lens:
-    model, (rows, columns) = calibration.camera_model, size
+    model = calibration.camera_model
     if model == 'panorama':
-        low, high = np.radians([panorama.elevation_min, panorama.elevation_max])
-        return CylinderLens((columns, rows), (float(low), float(high)))
+        return CylinderLens(replace(panorama.sphere, clockwise=True), size)
     if model == 'equirectangular':
-        return CylinderLens((columns, rows), (-np.pi / 2, np.pi / 2))
+        return CylinderLens(Sphere(-np.pi / 2, np.pi / 2), size)
     center = np.array([calibration.cx, calibration.cy])
     if model == 'polar':
         return RadialLens(center, np.ones(2), bend=_polar_bend(calibration))

@@ -29,24 +29,19 @@ def tilted(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
     """A level panorama (H, W, C) as taken by a robot with roll and pitch (2,) rad; its upper and
     lower rows are repeated beyond its edges.
     """
-    return _turned(panorama, rotation(*tilt), sphere)
+    return _rotated(panorama, rotation(*tilt), sphere)
 
 
 def leveled(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
     """The level panorama, from one (H, W, C) taken with roll and pitch (2,) rad."""
-    return _turned(panorama, rotation(*tilt).T, sphere)
+    return _rotated(panorama, rotation(*tilt).T, sphere)
 
 
-def _turned(panorama: Image, turn: Array, sphere: Sphere) -> Image:
-    rows, columns = panorama.shape[:2]
-    rays = sphere.rays(rows, columns).reshape(-1, 3).astype(np.float32)
-    x, y, z = (turn.astype(np.float32) @ rays.T).reshape(3, rows, columns)
-    azimuth = np.arctan2(y, x) * (-1 if sphere.clockwise else 1)
-    column = azimuth * (columns / (2 * np.pi)) + (columns / 2 + 0.5)
-    elevation = np.arcsin(np.clip(z, -1, 1))
-    row = (sphere.high - elevation) * (rows / (sphere.high - sphere.low)) - 0.5
+def _rotated(panorama: Image, turn: Array, sphere: Sphere) -> Image:
+    size = panorama.shape[:2]
+    pixels = sphere.pixels(sphere.rays(*size) @ turn.T, *size).astype(np.float32)
     wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
-    maps = np.asarray(column, np.float32), np.asarray(row, np.float32)
+    maps = pixels[..., 0] + 1, pixels[..., 1]
     turned = cv2.remap(wrapped, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(turned, panorama.dtype).reshape(panorama.shape)
 

@@ -42,6 +42,24 @@ class Sphere:
         clockwise = (np.arange(columns) + 0.5 - columns / 2) * 2 * np.pi / columns
         return -clockwise if self.clockwise else clockwise
 
+    def pixels(self, rays: Array, rows: int, columns: int) -> Array:
+        """Column and row (..., 2) of rays (..., 3) in a panorama of this size."""
+        x, y, z = np.moveaxis(rays, -1, 0)
+        azimuth = np.arctan2(y, x) * (-1 if self.clockwise else 1)
+        elevation = np.arctan2(z, np.hypot(x, y))
+        column = (azimuth / (2 * np.pi) + 0.5) * columns - 0.5
+        row = (self.high - elevation) / (self.high - self.low) * rows - 0.5
+        return np.stack([column, row], axis=-1)
+
+    def directions(self, pixels: Array, rows: int, columns: int) -> Array:
+        """Unit rays (..., 3) of pixels (..., 2); the inverse of `pixels`."""
+        column, row = np.moveaxis(pixels, -1, 0)
+        azimuth = ((column + 0.5) / columns - 0.5) * 2 * np.pi * (-1 if self.clockwise else 1)
+        elevation = self.high - (row + 0.5) / rows * (self.high - self.low)
+        level = np.cos(elevation)
+        parts = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
+        return np.stack(parts, axis=-1)
+
     def rays(self, rows: int, columns: int) -> Array:
         """Unit rays (rows, columns, 3) of the pixels, x forward, y left, z up; read-only."""
         return _rays(self, rows, columns)
@@ -49,8 +67,7 @@ class Sphere:
 
 @lru_cache(maxsize=4)
 def _rays(sphere: Sphere, rows: int, columns: int) -> Array:
-    elevation, azimuth = sphere.elevations(rows)[:, None], sphere.azimuths(columns)
-    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
-    rays = np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], axis=-1)
+    pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(float)
+    rays = sphere.directions(pixels, rows, columns)
     rays.setflags(write=False)
     return rays
