@@ -296,11 +296,12 @@ class _Survey:
             stream.required = False
             return stream
         if name == self._image:
-            return self._bag.any_stream(name, self._sample)
+            return self._bag.stream(name, self._sample, required=False)
         if name == self._imu:
-            return self._bag.any_stream(name, self._turning)
-        image = self._bag.topics[name].kind in KINDS['image'].found
-        return self._bag.any_stream(name, _checked if image else lambda message: None)
+            return self._bag.stream(name, self._turning, required=False)
+        image = self._bag.topics[name].kind in KINDS['image'].usual
+        convert = _checked if image else lambda message: None
+        return self._bag.stream(name, convert, required=False)
 
     def _sample(self, message: Any) -> tuple[float, NDArray[np.int8] | None]:
         """Decode an image; keep its size, and every so often the image itself.
