@@ -285,7 +285,7 @@ class _Survey:
         if samples:
             ((height, width), _), *_ = self._sizes.most_common(1)
             alike = [sample for sample in samples if sample.shape == samples[0].shape]
-            self._report.camera = kinds.kind_of(alike, width, height)
+            self._report.camera = kinds.CameraKind(*kinds.guess_geometry(alike), width, height)
         for stream in streams:
             if stream.topic == self._odometry and self._values[self._odometry]:
                 self._drive(stream)
@@ -296,13 +296,13 @@ class _Survey:
             stream.required = False
             return stream
         if name == self._image:
-            return self._bag.any_stream(name, self._take)
+            return self._bag.stream(name, self._take, required=False)
         if name == self._imu:
-            return self._bag.any_stream(name, self._yaw_rate)
-        is_image = self._bag.topics[name].kind in KINDS['image'].found
+            return self._bag.stream(name, self._yaw_rate, required=False)
+        is_image = self._bag.topics[name].kind in KINDS['image'].usual
         # Other images are decoded to detect damage, and not kept.
         check = (lambda m: decoding.image_of(m).shape) if is_image else (lambda _: None)
-        return self._bag.any_stream(name, check)
+        return self._bag.stream(name, check, required=False)
 
     def _take(self, message: Any) -> tuple[float, NDArray[np.int8] | None]:
         """Decode an image, and keep a sample now and then.

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sfa_localization.bags.drives import ReadingRecipe
-from sfa_localization.camera.kinds import require_one_view
+from sfa_localization.camera.kinds import require_single_view
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings, turns_and_textures
 from sfa_localization.data.events import DELAY_LIMIT_NS
@@ -148,7 +148,7 @@ def compared(
     Raises CameraError or DataError for contradictions; with `force` they are warnings.
     """
     if not force:
-        require_one_view(runs)
+        require_single_view(runs)
     images = [turns_and_textures(run.panoramas, recipe.panorama.clockwise) for run in runs]
     turns, textures = zip(*images, strict=True)
     corrected, checks = check_drives(runs, turns, force, textures)

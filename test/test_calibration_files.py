@@ -189,7 +189,7 @@ def test_what_is_written_is_read_again(tmp_path):
 
 UNUSABLE = [
     ('', 'no camera calibration'),
-    ('a: 1', 'no number fx or gamma1 or mu is given; known are'),
+    ('a: 1', 'no number fx or gamma1 or mu is given; supported are'),
     (info('plumb_bob', coefficients=[1, 2, 3, 4, 5]), 'only 4'),
     (info('strange'), "'strange' is not supported; use another"),
     (info('', coefficients=[], matrix=[0.0] * 9), 'not calib'),

@@ -160,7 +160,7 @@ INVALID = [
 
 # Text that is no parameter file, and no other YAML of a user.
 REJECTED = {
-    'a: 2001-99-99': 'has a date or a number that cannot be: month must',
+    'a: 2001-99-99': 'has an impossible date or number: month must',
     'a: ' + '[' * 40 + ']' * 40: 'nested deeper than 32',
     'a: 1\nb: 2\na: 3': "the key 'a' twice",
     'a: !!python/object/apply:os.system [x]': 'could not determine a constructor',

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a bag: decoded by rosbags, and the fields of them that are used."""
+"""Messages of a bag: decoded by rosbags, and the values of their fields."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from sfa_localization.bags.files import Topic
 from sfa_localization.camera.encodings import read_compressed, read_raw
 from sfa_localization.data.errors import BagError, MessageError
-from sfa_localization.data.messages import read_planar, read_stamp, read_twist, require_sane
+from sfa_localization.data.messages import read_planar, read_twist, require_sane
 from sfa_localization.data.run import Image
 
 IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
@@ -24,19 +24,19 @@ STAMPED_POSES = (
     'geometry_msgs/msg/TransformStamped',
 )
 POSES = (ODOMETRY, *STAMPED_POSES, TF)
-"""Types that hold a pose of the robot."""
+"""Types with a pose of the robot."""
 PLACES = (*STAMPED_POSES[:2], 'geometry_msgs/msg/PointStamped')
-"""Types that hold a place."""
+"""Types with a measured point."""
 SERIALIZATIONS = {'cdr': Stores.ROS2_JAZZY, 'ros1': Stores.ROS1_NOETIC}
 """The standard types of each wire format."""
 typestore = functools.cache(get_typestore)
-"""The standard message types of a distribution, made once."""
+"""The standard message types of a distribution."""
 
 
 def can_decode(topic: Topic) -> bool:
     """Whether the messages of a topic are of a standard type."""
-    known = topic.serialization in SERIALIZATIONS
-    return known and topic.kind in typestore(SERIALIZATIONS[topic.serialization]).fielddefs
+    store = SERIALIZATIONS.get(topic.serialization)
+    return store is not None and topic.kind in typestore(store).fielddefs
 
 
 def decode(data: bytes, topic: Topic) -> Any:
@@ -58,14 +58,8 @@ def transform_to(frame: str, message: Any, topic: str) -> Any:
     return frames.get(frame.lstrip('/'))
 
 
-def header_stamp(message: Any) -> int | None:
-    """The sender's stamp in ns; None of a type without a header. Raises MessageError."""
-    header = getattr(message, 'header', None)
-    return None if header is None else read_stamp(header.stamp)
-
-
 def image_of(message: Any) -> Image:
-    """Image (H, W, 3) BGR of an Image or CompressedImage. Raises MessageError."""
+    """Image (H, W, 3) BGR of an Image or CompressedImage. Raises CameraError."""
     return (read_compressed if message.__msgtype__ == COMPRESSED else read_raw)(message)
 
 

@@ -1,9 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read drives as runs by a recipe: panoramas on disk, joined to odometry, each bag in one pass."""
+"""Read bags as runs: panoramas on disk and odometry, in one pass."""
 
 from __future__ import annotations
 
+import itertools
 import logging
 import tempfile
 from collections.abc import Collection, Sequence
@@ -32,21 +33,19 @@ from sfa_localization.data.run import Image, PanoramaArray, Panoramas, Run, Stam
 from sfa_localization.data.sphere import Sphere
 
 ODOMETRY_TOLERANCE_S = 0.5
-"""An image is used when odometry lies this near on both sides (s): interpolating over a longer
-pause would invent a path."""
-SAME_IMAGE_NS = 1_000_000
-"""Stamps this near to each other are those of one image: no camera takes a thousand a second."""
+"""An image is used when odometry before and after it is this near (s); poses are not interpolated
+over a longer pause."""
+_SAME_IMAGE_NS = 1_000_000  # stamps of one image differ by less
 logger = logging.getLogger(__name__)
 R = TypeVar('R', bound='ReadingRecipe')
 
 
 @dataclass(frozen=True, slots=True)
 class ReadingRecipe:
-    """Everything that decides how a bag becomes a run of panoramas.
+    """How a bag becomes a run of panoramas.
 
-    Images farther than `odometry_tolerance_s` from odometry (0: outside all of it) are left out;
-    where only `distinct` ones are wanted, also those that repeat the one before, which was taken
-    elsewhere.
+    Images farther than `odometry_tolerance_s` from odometry are left out (0: images before or after
+    all of it), and with `distinct` also repetitions of the previous image.
     """
 
     topics: TopicNames = field(default_factory=TopicNames)
@@ -66,9 +65,8 @@ def as_live(recipe: R, panorama: PanoramaConfig) -> R:
 
 
 def image_folder(output: Path) -> Path:
-    """The folder of `output`, for decoded images: files without a name, gone with their process.
-
-    Raises ModelError where `output` could not be written in the end.
+    """The folder of `output`, for temporary files of images. Raises ModelError where `output` could
+    not be written.
     """
     try:
         replaced_mode(output)
@@ -86,35 +84,29 @@ def read_drives(
     *,
     strict: bool = False,
 ) -> tuple[Run, ...]:
-    """Read different drives to learn from, with panoramas of one size.
+    """Read different drives for training, with panoramas of one size and without repetitions.
 
-    Images that repeat the one before are left out. Raises BagError or DataError.
+    Raises BagError or DataError.
     """
     distinct = replace(recipe, distinct=True)
     runs = tuple(read_drive(bag, cache, distinct, progress, strict=strict) for bag in bags)
-    for k, run in enumerate(runs):
-        for other in runs[:k]:
-            if _same_recording(run, other):
-                raise DataError(
-                    f'{bags[k]}: the same drive as {other.name}: name each drive once, because a '
-                    'part that is left out to check the map must not be learned from its copy'
-                )
+    for (_, other), (bag, run) in itertools.combinations(zip(bags, runs, strict=True), 2):
+        if _same_recording(run, other):
+            raise DataError(
+                f'{bag}: the same drive as {other.name}: name each drive once, because images '
+                'held out to check the map must not be learned from a copy'
+            )
     if len({run.panoramas.shape for run in runs}) > 1:
         sizes = ', '.join(f'{r.name}: {r.panoramas.shape[1]}x{r.panoramas.shape[0]}' for r in runs)
         raise DataError(f'the bags hold panoramas of different sizes ({sizes}): train on one size')
-    _compare_size(runs[0], recipe.panorama)
-    return runs
-
-
-def _compare_size(run: Run, asked: PanoramaConfig) -> None:
-    """Say where panoramas were recorded, so that a size that was asked for has no effect."""
-    height, width, _ = run.panoramas.shape
-    usual = PanoramaConfig()
+    height, width, _ = runs[0].panoramas.shape
+    asked, usual = recipe.panorama, PanoramaConfig()
     if (asked.width, asked.height) not in {(width, height), (usual.width, usual.height)}:
         logger.warning(
             '%s: its panoramas are %dx%d and stay so: width and height (%dx%d) are for images of '
-            'a camera', run.name, width, height, asked.width, asked.height,
+            'a camera', runs[0].name, width, height, asked.width, asked.height,
         )  # fmt: skip
+    return runs
 
 
 def _same_recording(run: Run, other: Run) -> bool:
@@ -122,8 +114,8 @@ def _same_recording(run: Run, other: Run) -> bool:
     if not np.array_equal(run.panoramas.stamps_ns, other.panoramas.stamps_ns):
         return False
     middle = len(run.panoramas) // 2
-    one, two = (drive.panoramas.read(middle, middle + 1) for drive in (run, other))
-    return np.array_equal(one, two)
+    image, other_image = (drive.panoramas.read(middle, middle + 1) for drive in (run, other))
+    return np.array_equal(image, other_image)
 
 
 def read_drive(
@@ -135,16 +127,16 @@ def read_drive(
     want_truth: bool = False,
     strict: bool = False,
 ) -> Run:
-    """Read one bag in one pass; camera images are unwrapped to panoramas, and lie in `cache`.
+    """Read one bag in one pass; its panoramas are stored in `cache`.
 
-    Without `want_truth` no topic of true poses is even opened. Images of another size than the
-    first are skipped and counted. Raises BagError.
+    Only with `want_truth` a topic of true poses is opened. Images of another size than the first
+    are skipped and counted. Raises BagError.
     """
     recipe = recipe or ReadingRecipe()
     with Bag(path, strict=strict, config=recipe.bag) as bag:
         name = bag.find('image', recipe.topics.image)
         try:
-            stored = _Images(Path(cache), recipe)
+            stored = _PanoramaFile(Path(cache), recipe)
             streams = {'images': bag.stream(name, stored.panorama)}
             streams |= _other_streams(bag, recipe, want_truth)
             values = _read(bag, streams, stored, progress)
@@ -154,8 +146,8 @@ def read_drive(
             _require_covered(streams['images'], covered, near_s)
             panoramas: Panoramas = stored.finish(stamps_ns, covered)
             if recipe.camera.level_by_imu:
-                by, tilts = streams['orientation'], values['orientation']
-                panoramas = _leveled(panoramas, by, tilts, recipe.panorama.sphere)
+                imu, tilts = streams['orientation'], values['orientation']
+                panoramas = _leveled(panoramas, imu, tilts, recipe.panorama.sphere)
         except OSError as error:
             raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
         camera = camera_place(bag, name, streams['odometry'].topic)
@@ -168,8 +160,8 @@ def read_drive(
     return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, points, counts, camera)
 
 
-class _Images:
-    """Makes panoramas of one size, and stores them in a file without a name."""
+class _PanoramaFile:
+    """Makes panoramas of one size, and stores them in a temporary file."""
 
     def __init__(self, folder: Path, recipe: ReadingRecipe) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -203,13 +195,12 @@ class _Images:
         images = np.memmap(self._file, np.uint8, 'r+', shape=(len(keep), *self._shape))
         kept = np.flatnonzero(keep)
         for target, source in enumerate(kept):
-            if target != source:
-                images[target] = images[source]
+            images[target] = images[source]
         return PanoramaArray(stamps_ns[kept], images[: len(kept)], self._file)
 
 
 def _other_streams(bag: Bag, recipe: ReadingRecipe, want_truth: bool) -> dict[str, Stream]:
-    """The topics beside the images that make a run, by their use."""
+    """The other topics of a run, by their use."""
     topics = recipe.topics
     name = bag.find('odometry', topics.odometry)
     streams = {'odometry': bag.stream(name, decoding.odometry_of)}
@@ -232,7 +223,7 @@ def _other_streams(bag: Bag, recipe: ReadingRecipe, want_truth: bool) -> dict[st
 
 
 def _read(
-    bag: Bag, streams: dict[str, Stream], stored: _Images, progress: bool
+    bag: Bag, streams: dict[str, Stream], stored: _PanoramaFile, progress: bool
 ) -> dict[str, StampedValues]:
     """Store the images; return the values of the other streams by their use."""
     uses = {id(stream): use for use, stream in streams.items()}
@@ -248,21 +239,21 @@ def _read(
     return values
 
 
-def _leveled(panoramas: Panoramas, by: Stream, tilts: StampedValues, sphere: Sphere) -> Panoramas:
+def _leveled(panoramas: Panoramas, imu: Stream, tilts: StampedValues, sphere: Sphere) -> Panoramas:
     """The panoramas as omnicam_node levels them. Raises BagError where none can be leveled."""
-    stamps, known = (np.array(part) for part in zip(*sorted(tilts), strict=True))
-    found = tilts_at(panoramas.stamps_ns, stamps, known)
-    lost = int(np.isnan(found).any(axis=1).sum())
-    missing = f'{by.bag}: {by.topic} has no orientation near {lost} of {len(panoramas)} images'
+    stamps_ns, measured = (np.array(part) for part in zip(*sorted(tilts), strict=True))
+    image_tilts = tilts_at(panoramas.stamps_ns, stamps_ns, measured)
+    lost = int(np.isnan(image_tilts).any(axis=1).sum())
+    missing = f'{imu.bag}: {imu.topic} has no orientation near {lost} of {len(panoramas)} images'
     if lost == len(panoramas):
         raise BagError(f'{missing}: are both stamped by one clock (stamp_source: receive)?')
     if lost:
-        logger.warning('%s: they are not leveled by it', missing)
-    return LeveledPanoramas(panoramas, np.nan_to_num(found), sphere)
+        logger.warning('%s: these are not leveled', missing)
+    return LeveledPanoramas(panoramas, np.nan_to_num(image_tilts), sphere)
 
 
 def _require_covered(images: Stream, covered: NDArray[np.bool_], near_s: float) -> None:
-    """Count the images without odometry. Raises BagError where none has some."""
+    """Count the images without odometry. Raises BagError where no image has odometry."""
     lost = int(np.count_nonzero(~covered))
     near = f'within {near_s:g} s' if near_s else 'before and after'
     if lost:
@@ -276,14 +267,13 @@ def _require_covered(images: Stream, covered: NDArray[np.bool_], near_s: float) 
 
 
 def images_at(bag: Path, stamps_ns: Collection[int], recipe: ReadingRecipe) -> dict[int, Image]:
-    """The camera's images (H, W, 3) of a bag at some stamps, by these stamps.
-
-    Those that are not within SAME_IMAGE_NS of an image are left out. Raises BagError.
+    """The camera's images (H, W, 3) of a bag, by those of the stamps that are within a millisecond
+    of an image. Raises BagError.
     """
-    found: dict[int, Image] = {}
+    images: dict[int, Image] = {}
     with Bag(bag, config=recipe.bag) as opened:
         for stamp_ns, image in opened.images(recipe.topics.image) if stamps_ns else ():
-            found |= {at: image for at in stamps_ns if abs(at - stamp_ns) <= SAME_IMAGE_NS}
-            if len(found) == len(stamps_ns):
+            images |= {at: image for at in stamps_ns if abs(at - stamp_ns) <= _SAME_IMAGE_NS}
+            if len(images) == len(stamps_ns):
                 break
-    return found
+    return images

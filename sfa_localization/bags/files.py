@@ -1,9 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The files of bags, read by libraries: mcap by the package mcap, sqlite3 and ROS 1 by rosbags.
+"""The files of bags: mcap is read by the package mcap, sqlite3 and ROS 1 by rosbags.
 
-A file that was cut off is read up to the cut, except one of ROS 1, which has no beginning without
-its end. Files are never written to.
+A file that was cut off is read up to the cut, except for ROS 1. Files are never written to.
 """
 
 from __future__ import annotations
@@ -34,10 +33,9 @@ from sfa_localization.data.plain_yaml import load_yaml
 from sfa_localization.data.rejections import short_line
 
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
-LARGEST = 1 << 28
-"""Bytes of a chunk or a message: one image of the largest camera, and room for others."""
-LATEST = 1 << 63
-"""The end of the times that ROS has."""
+_LARGEST = 1 << 28  # bytes of a chunk or a message: one image of the largest camera, and more
+_QOS = 'offered_qos_profiles'
+_LATEST = 1 << 63  # ns, the end of ROS time
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,18 +54,17 @@ Record = tuple[Topic, int, bytes]
 
 
 def make_topic(name: Any, kind: Any, serialization: Any, qos: Any, count: Any) -> Topic:
-    """A topic from the fields of a file; older recorders leave out the 'msg' of a type.
+    """A topic from the fields of a file; older recorders omit the 'msg' of a type.
 
-    `qos` are profiles, or the text or list of a recorder; none where it is unreadable.
+    `qos` are profiles, or the text or list of a recorder; unreadable ones are left out.
     """
-    parts = short_line(str(kind)).split('/')
-    full = '/'.join([parts[0], 'msg', parts[1]] if len(parts) == 2 else parts)
+    name, kind, serialization = (short_line(str(text)) for text in (name, kind, serialization))
+    kind = kind.replace('/', '/msg/') if kind.count('/') == 1 else kind
     profiles: list[Qos] = []
     with suppress(Exception):  # a bag is not rejected because of its QoS
-        found = load_yaml(qos) if isinstance(qos, str) else qos
-        profiles = [p for q in found or () for p in ([q] if isinstance(q, Qos) else parse_qos([q]))]
-    texts = short_line(str(name)), full, short_line(str(serialization))
-    return Topic(*texts, tuple(profiles), int(count))
+        listed = load_yaml(qos) if isinstance(qos, str) else qos
+        profiles = [p if isinstance(p, Qos) else parse_qos([p])[0] for p in listed or ()]
+    return Topic(name, kind, serialization, tuple(profiles), int(count))
 
 
 def add_problem(problems: list[str], text: str) -> None:
@@ -77,7 +74,7 @@ def add_problem(problems: list[str], text: str) -> None:
 
 
 def describe(error: Exception) -> str:
-    """What a library says of damage, or the class of its error."""
+    """The text of a library's error, or its class."""
     return short_line(str(error)).rstrip('.') or type(error).__name__
 
 
@@ -89,7 +86,7 @@ class McapFile:
 
     def __init__(self, path: Path, problems: list[str]) -> None:
         self._path, self._problems, self._file = path, problems, path.open('rb')
-        self.start_ns, self.topics = LATEST, dict[int, Topic]()
+        self.start_ns, self.topics = _LATEST, dict[int, Topic]()
         damage = self._read_index()
         if not self.topics:
             self._scan()
@@ -111,13 +108,13 @@ class McapFile:
             for record in records:
                 if type(record) is Message and (topic := wanted.get(record.channel_id)):
                     stamp_ns = record.log_time
-                    if start_ns <= stamp_ns < LATEST:
+                    if start_ns <= stamp_ns < _LATEST:
                         yield topic, stamp_ns, record.data
 
     def _read_index(self) -> str:
-        """Take the topics from the end of the file; return its damage in words."""
+        """Read the topics from the end of the file; return its damage in words."""
         try:
-            summary = SeekingReader(self._file, record_size_limit=LARGEST).get_summary()
+            summary = SeekingReader(self._file, record_size_limit=_LARGEST).get_summary()
         except Exception as error:  # a parser of foreign bytes fails in many ways
             return describe(error)
         if summary is not None and summary.statistics is not None:
@@ -144,17 +141,16 @@ class McapFile:
         self, channels: dict[int, Channel], schemas: dict[int, Schema], counts: dict[int, int]
     ) -> None:
         for key, channel in channels.items():
-            kind = schemas[channel.schema_id].name if channel.schema_id in schemas else ''
-            qos = channel.metadata.get('offered_qos_profiles', '')
-            fields = channel.topic, kind, channel.message_encoding, qos
+            schema, qos = schemas.get(channel.schema_id), channel.metadata.get(_QOS, '')
+            fields = channel.topic, schema.name if schema else '', channel.message_encoding, qos
             self.topics[key] = make_topic(*fields, counts.get(key, 0))
 
     def _parts(self, start_ns: int) -> Iterator[list[Any]]:
-        """The records of each chunk that ends at or after `start_ns`, and each one outside of
-        chunks, up to where they make no sense. Damaged chunks are skipped.
+        """The records of each chunk that ends at or after `start_ns`, and each record outside of
+        chunks, up to the first unreadable one. Damaged chunks are skipped.
         """
         self._file.seek(0)
-        reader = StreamReader(self._file, emit_chunks=True, record_size_limit=LARGEST)
+        reader = StreamReader(self._file, emit_chunks=True, record_size_limit=_LARGEST)
         with suppress(Exception):  # as above
             for record in reader.records:
                 if not isinstance(record, Chunk):
@@ -168,7 +164,7 @@ class McapFile:
 
 
 class RosbagsFile:
-    """One file of sqlite3 or ROS 1, which rosbags reads; a damaged one of sqlite3 from a copy."""
+    """One file of sqlite3 or ROS 1, read by rosbags; a damaged database is copied first."""
 
     def __init__(
         self, path: Path, problems: list[str], reader: Sqlite3Reader | Ros1Reader, start_ns: int
@@ -194,7 +190,7 @@ class RosbagsFile:
 
     @classmethod
     def sqlite(cls, path: Path, problems: list[str]) -> RosbagsFile:
-        """Open a .db3 file; of a damaged one what is before the damage. Raises BagError."""
+        """Open a .db3 file; a damaged one up to the damage. Raises BagError."""
         try:
             reader = _sqlite_reader(path)
         except Exception as error:  # as above
@@ -230,8 +226,8 @@ def _sqlite_reader(path: Path) -> Sqlite3Reader:
 
 
 def _salvaging_reader(path: Path) -> Sqlite3Reader:
-    """A reader of a copy of the topics, and of the messages up to the damage. Raises BagError."""
-    # The reader keeps the copy, which loses its name here, until it is closed.
+    """A reader of a copy of the topics and of the messages up to the damage. Raises BagError."""
+    # The reader keeps the unnamed copy until it is closed.
     with TemporaryDirectory(prefix='bag-') as folder:
         try:
             return _sqlite_reader(_intact_rows(path, Path(folder) / 'copy.db3'))
@@ -262,14 +258,14 @@ READERS: dict[bytes, Callable[[Path, list[str]], StoredFile]] = {
     b'\x89MCAP0\r\n': McapFile,
     b'#ROSBAG V': RosbagsFile.ros1,
 }
-"""By the first bytes of a file, what opens it, with a list for its problems."""
+"""What opens a file, by its first bytes; takes the path and a list of problems."""
 
 
 def inflate_message(data: bytes) -> bytes:
     """Undo the recorder's compression of a message. Raises MessageError."""
     try:
-        if frame_content_size(data) <= LARGEST:
-            return ZstdDecompressor().decompress(data, max_output_size=LARGEST)
+        if frame_content_size(data) <= _LARGEST:
+            return ZstdDecompressor().decompress(data, max_output_size=_LARGEST)
     except ZstdError:
         pass
     raise MessageError('damaged compressed message')

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry, yaw rates and trajectories as arrays, from the stamped values of a bag's streams."""
+"""Arrays of odometry, yaw rates and trajectories from the stamped values of streams."""
 
 from __future__ import annotations
 
@@ -21,9 +21,8 @@ from sfa_localization.data.run import (
 )
 
 StampedValues = list[tuple[int, Any]]
-"""Stamps in ns, each with the value that was read from its message."""
-_DRIVING_MPS = 0.01
-"""A robot this fast is driving (m/s): above the noise of wheel encoders at rest."""
+"""Stamps in ns, each with the value of its message."""
+_DRIVING_MPS = 0.01  # above the noise of wheel encoders at rest
 
 
 def _stamps(values: StampedValues) -> Stamps:
@@ -50,10 +49,10 @@ def to_points(values: StampedValues) -> Points:
 
 
 def to_odometry(values: StampedValues) -> tuple[Odometry, str]:
-    """Odometry, and what is odd about it, in words.
+    """Odometry, and an oddity of it in words, or ''.
 
-    The values are a pose, with v, omega and their variances, or with None where the messages hold
-    poses only: then twists are the differences of the poses.
+    The values are a pose with v, omega and their variances, or with None where messages have only
+    poses: then twists are the differences of poses.
     """
     stamps = _stamps(values)
     poses = np.array([pose for _, (pose, _) in values], float).reshape(-1, 3)

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read any ROS 1 or ROS 2 bag: its topics by their use, and their messages as stamped values.
 
-Nothing is lost silently: the message counts of the bag are compared with what was read, and every
-message that is not used is counted with its reason. Bags are never written to.
+Nothing is lost silently: the messages read are compared with the counts of the bag, and each unused
+message is counted with its reason. Bags are never written to.
 """
 
 from __future__ import annotations
@@ -22,25 +22,24 @@ from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.settings import BagConfig
 from sfa_localization.bags.topic_stream import Item, Stream
 from sfa_localization.data.errors import BagError, LocalizationError, MessageError
-from sfa_localization.data.messages import NO_STAMP, read_yaw_rate
+from sfa_localization.data.messages import NO_STAMP, read_stamp, read_yaw_rate
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate
 
-OWN_TOPICS = re.compile(r'/(ekf|sfa)/|/panorama(/compressed)?$')
-"""What omnicam_node, sfa_node and ekf_node publish is no input where others are recorded too."""
+PUBLISHED = re.compile(r'/(ekf|sfa)/|/panorama(/compressed)?$')
+"""Topics of omnicam_node, sfa_node and ekf_node; an input is preferred to them."""
 REMEDY = 'try `mcap recover` on its files, or `ros2 bag reindex`'
-MOST_TOPICS = 8
-"""Topics that an error message lists."""
+_LISTED = 8  # topics of an error message
 
 
 class Kind(NamedTuple):
-    """The use of a topic: its title in errors, its command line flag, the types by which it is
-    found, and those accepted when it is named.
+    """The use of a topic: its title in errors, its command line flag, the `usual` types by which it
+    is chosen, and the types `accepted` when it is named.
     """
 
     title: str
     flag: str
-    found: tuple[str, ...]
-    named: tuple[str, ...]
+    usual: tuple[str, ...]
+    accepted: tuple[str, ...]
 
 
 _IMAGES, _TRUTH = (decoding.IMAGE, decoding.COMPRESSED), decoding.STAMPED_POSES
@@ -56,8 +55,8 @@ KINDS = {
 class Bag:
     """Context manager over one bag: a folder, or a single .db3, .mcap or .bag file.
 
-    `strict` raises for damaged bags and messages instead of counting the losses. An open bag has
-    all `topics` by name, and the `problems` found so far. Raises BagError.
+    `strict` raises for damaged bags and messages instead of counting them. An open bag has all
+    `topics` by name, and its `problems` so far. Raises BagError.
     """
 
     def __init__(
@@ -82,32 +81,31 @@ class Bag:
         return {topic: stream.count for topic, stream in self._streams.items()}
 
     def find(self, kind: str, topic: str = '') -> str:
-        """Name of the topic that serves as `kind` (a key of KINDS): the named, or the only one.
+        """Name of the topic of a `kind` (a key of KINDS): the given one, or the only one.
 
-        Raises BagError when it is missing, of another type, or one of several.
+        Raises BagError when it is missing, of another type, or ambiguous.
         """
         wanted = KINDS[kind]
         if topic:
             return self._named(wanted, topic)
-        found = [t for t in self.topics.values() if t.kind in wanted.found and t.count]
-        found = [t for t in found if not OWN_TOPICS.search(t.name)] or found
-        if not found:
-            kinds = _short(wanted.found, ' or ')
-            has = self._contents(wanted)
+        topics = [t for t in self.topics.values() if t.kind in wanted.usual and t.count]
+        topics = [t for t in topics if not PUBLISHED.search(t.name)] or topics
+        if not topics:
+            kinds, has = _short(wanted.usual, ' or '), self._contents(wanted)
             raise BagError(f'{self.path}: has no {wanted.title} ({kinds}); {has}')
-        if len(found) > 1:
-            names = ', '.join(sorted(topic.name for topic in found))
+        if len(topics) > 1:
+            names = ', '.join(sorted(t.name for t in topics))
             raise BagError(f'{self.path}: several topics have {wanted.title}: {names}; '
                            f'choose one with {wanted.flag}')  # fmt: skip
-        return self._readable(found[0])
+        return self._readable(topics[0])
 
     def _named(self, wanted: Kind, name: str) -> str:
         plain, colon, child_frame = name.lstrip('/').partition(':')
         topic = self.topics.get(f'/{plain}') or self.topics.get(plain)
         if topic is None:
             raise BagError(f'{self.path}: has no topic {name}; {self._contents(wanted)}')
-        if topic.kind not in wanted.named:
-            kinds = _short(wanted.named, ', ')
+        if topic.kind not in wanted.accepted:
+            kinds = _short(wanted.accepted, ', ')
             raise BagError(f'{self.path}: {topic.name} is {topic.kind or "of unknown type"}, not '
                            f'one of {kinds}; name another with {wanted.flag}')  # fmt: skip
         if topic.count == 0:
@@ -122,9 +120,9 @@ class Bag:
 
     def _contents(self, wanted: Kind) -> str:
         """The topics that the bag has, and the remedy."""
-        kinds = sorted(f'{t.name} ({_short([t.kind])}, {t.count})' for t in self.topics.values())
-        shown = ', '.join(kinds[:MOST_TOPICS] + ['...'] * (len(kinds) > MOST_TOPICS)) or 'no topics'
-        return f'it has {shown}: record one, or name one with {wanted.flag}'
+        names = sorted(f'{t.name} ({_short([t.kind])}, {t.count})' for t in self.topics.values())
+        listed = ', '.join(names[:_LISTED] + ['...'] * (len(names) > _LISTED)) or 'no topics'
+        return f'it has {listed}: record one, or name one with {wanted.flag}'
 
     def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
         """Stamps and images (H, W, 3) BGR, one at a time."""
@@ -149,24 +147,21 @@ class Bag:
         return ((stamp_ns, value) for _, stamp_ns, value in self.read([stream]))
 
     def to_odometry(self, stream: Stream, values: StampedValues) -> Odometry:
-        """Odometry of a stream's values; what is odd about it is noted as a problem."""
+        """Odometry from a stream's values; an oddity is noted as a problem."""
         odometry, oddity = motion.to_odometry(values)
         self.problems += [f'{stream.topic}: {oddity}'] if oddity else []
         return odometry
 
-    def stream(self, name: str, convert: Callable[[Any], Any]) -> Stream:
-        """A topic to be read; of a TFMessage, '/tf:FRAME' names the transform that is wanted."""
-        topic, _, frame = name.partition(':')
-        self._streams[topic] = Stream(self.path, topic, convert, self.strict)
-        if self.topics[topic].kind == decoding.TF:
-            self._streams[topic].frame = frame
-        return self._streams[topic]
+    def stream(self, name: str, convert: Callable[[Any], Any], *, required: bool = True) -> Stream:
+        """A topic to be read; of a required TFMessage, '/tf:FRAME' selects a transform.
 
-    def any_stream(self, topic: str, convert: Callable[[Any], Any]) -> Stream:
-        """A topic of any type, which may be empty; unknown types have the value None."""
+        Messages of unknown types have the value None.
+        """
+        topic, _, frame = name.partition(':')
         stream = self._streams[topic] = Stream(self.path, topic, convert, self.strict)
-        stream.opaque = not decoding.can_decode(self.topics[topic])
-        stream.required = False
+        stream.required, stream.opaque = required, not decoding.can_decode(self.topics[topic])
+        if required and self.topics[topic].kind == decoding.TF:
+            stream.frame = frame
         return stream
 
     def read(self, streams: Iterable[Stream]) -> Iterator[tuple[Stream, int, Any]]:
@@ -187,7 +182,7 @@ class Bag:
             self._check_complete(stream)
 
     def _item(self, stream: Stream, topic: Topic, receive_ns: int, data: bytes) -> Item | None:
-        """The stamp and value of a message; None of one that is counted as rejected."""
+        """The stamp and value of a message; None of one that is rejected and counted."""
         if stream.opaque:
             return Item(receive_ns, receive_ns, None)
         try:
@@ -197,8 +192,9 @@ class Bag:
             if part is None:
                 stream.skipped.add('transforms of other frames')
                 return None
-            stamp_ns = decoding.header_stamp(part) if self._by_header else None
-            return Item(stamp_ns or receive_ns, receive_ns, stream.convert(part))
+            header = getattr(part, 'header', None) if self._by_header else None
+            stamp_ns = receive_ns if header is None else read_stamp(header.stamp)
+            return Item(stamp_ns, receive_ns, stream.convert(part))
         except BagError:
             raise
         except LocalizationError as error:
@@ -206,7 +202,7 @@ class Bag:
             return None
 
     def messages(self, topics: Iterable[str], start_ns: int = 0) -> Iterator[Record]:
-        """Topic, reception in ns and serialized bytes, as recorded, and in its order."""
+        """Topic, reception in ns and serialized bytes, in the order of recording."""
         for record in self.recording.messages(set(topics), start_ns):
             if record[2][:4] != ZSTD_MAGIC:
                 yield record
@@ -217,7 +213,7 @@ class Bag:
                 add_problem(self.problems, f'{record[0].name}: {error}')
 
     def _check_complete(self, stream: Stream) -> None:
-        """Compare the messages read with the bag's own count; no usable message is an error."""
+        """Compare the messages read with the bag's count; no usable message is an error."""
         expected = self.topics[stream.topic].count
         if stream.received < expected:
             lost = f'{stream.received} of {expected} messages read; {REMEDY}'
@@ -225,9 +221,8 @@ class Bag:
             stream.skipped.add('lost in a damaged bag', expected - stream.received)
         self._raise_problems()
         if stream.required and stream.used == 0:
-            reasons = (
-                ', '.join(f'{n} {why}' for why, n in stream.skipped.items()) or 'none recorded'
-            )
+            reasons = ', '.join(f'{n} {why}' for why, n in stream.skipped.items())
+            reasons = reasons or 'none recorded'
             remedy = f'; {REMEDY}' if stream.received < expected else ''
             if NO_STAMP in reasons:
                 remedy = '; try the time of reception (stamp_source: receive)'

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag on disk: its files, its metadata, and the message counts of both.
 
-Not the directory reader of rosbags (0.11.9), which rejects a bag for a missing file or for newer
-metadata, and reads 0 of 145 messages, without an error, where metadata and file spell a type
-differently (test_bag.py::test_silence_of_a_library_is_an_error).
+The directory reader of rosbags (0.11.9) rejects a bag with a missing file or newer metadata, and
+reads no message, without an error, where metadata and file spell a type differently
+(test_bag.py::test_silence_of_a_library_is_an_error).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from sfa_localization.bags.files import (
     make_topic,
 )
 from sfa_localization.data.errors import BagError
-from sfa_localization.data.files import is_regular, read_regular, start_of
+from sfa_localization.data.files import first_bytes, read_regular
 from sfa_localization.data.plain_yaml import LONGEST, load_yaml
 from sfa_localization.data.rejections import short_line
 
@@ -37,7 +37,7 @@ SUFFIXES = ('.db3', '.mcap', '.bag', '.db3.zstd', '.mcap.zstd')
 
 
 def recorded_files(path: Path) -> list[Path]:
-    """The files of the bag at a path that is a folder or a metadata.yaml; any other path alone."""
+    """The files of a bag, if the path is its folder or its metadata.yaml; else the path."""
     folder = path.parent if path.name == METADATA else path
     try:
         return [folder / name for name in _bag_files(folder)] + [folder / METADATA]
@@ -46,15 +46,15 @@ def recorded_files(path: Path) -> list[Path]:
 
 
 def _bag_files(folder: Path) -> list[str]:
-    """Names of the files of a folder that can be of a bag. Raises OSError."""
+    """Names of the files of a folder with suffixes of bags. Raises OSError."""
     return sorted(name for name in os.listdir(folder) if name.endswith(SUFFIXES))
 
 
 class Recording:
     """The files of a bag opened as one; `path` is a folder, a single file or a metadata.yaml.
 
-    `topics` are by name, each with the larger of its counts in the metadata and in the files;
-    `notes` are unusual findings that are no damage. Raises BagError.
+    `topics` are by name, each with the larger of its counts in metadata and files; `notes` are
+    oddities without damage. Raises BagError.
     """
 
     def __init__(self, path: Path) -> None:
@@ -75,9 +75,9 @@ class Recording:
         self.topics = {topic.name: topic for topic in topics}
         for topic in (topic for file in self._files for topic in file.topics.values()):
             stored[topic.name] += topic.count
-            told = self.topics.get(topic.name, topic)
-            count = max(told.count, stored[topic.name])
-            self.topics[topic.name] = replace(topic, qos=topic.qos or told.qos, count=count)
+            declared = self.topics.get(topic.name, topic)
+            count = max(declared.count, stored[topic.name])
+            self.topics[topic.name] = replace(topic, qos=topic.qos or declared.qos, count=count)
 
     def close(self) -> None:
         """Release all files."""
@@ -89,20 +89,20 @@ class Recording:
             yield from file.messages(names, start_ns)
 
     def _read_metadata(self) -> tuple[list[str], list[Topic]]:
-        """Names of the files, and the topics that the metadata tell of."""
+        """Names of the files, and the topics in the metadata."""
         if not os.path.exists(self.path):
             raise BagError(f'{short_line(str(self.path))}: no such bag; check the path')
-        if is_regular(self.path):
+        if os.path.isfile(self.path):
             return [self.path.name], []
         if not self.path.is_dir():
             raise BagError(f'{self.path}: is neither a file nor a folder; copy it to a file')
         file = self.path / METADATA
         try:
-            found = _bag_files(self.path)
+            files = _bag_files(self.path)
             names, topics = parse_metadata(read_regular(file, LONGEST).decode(errors='replace'))
             self.problems += [
                 f'{name} is in the folder, but not in {METADATA}: it is not read'
-                for name in sorted(set(found) - set(names))
+                for name in sorted(set(files) - set(names))
             ]
             return names, topics
         except FileNotFoundError:
@@ -112,9 +112,9 @@ class Recording:
         except ValueError as error:
             self.problems.append(f'{METADATA} is damaged ({error}); rebuilt from the files, as '
                                  '`ros2 bag reindex` does for good')  # fmt: skip
-        if not found:
+        if not files:
             raise BagError(f'{self.path}: no bag: neither {METADATA} nor .db3, .mcap, .bag')
-        return found, []
+        return files, []
 
     def _open_files(self, names: list[str]) -> None:
         """Open each file once. Raises BagError when none can be read."""
@@ -125,8 +125,6 @@ class Recording:
                 file = self._open_file(path)
                 self._open.callback(file.close)
                 self._files.append(file)
-            except FileNotFoundError:
-                failures.append(f'{path}: is missing; copy all files of the bag')
             except (OSError, ValueError) as error:
                 failures.append(f'{path}: cannot be read: {describe(error)}')
             except BagError as error:
@@ -138,14 +136,16 @@ class Recording:
     def _open_file(self, path: Path) -> StoredFile:
         """Open one file, or a decompressed copy, by its first bytes. Raises OSError or BagError."""
         plain, damage = path, ''
-        if path.exists() and not is_regular(path):
+        if not path.exists():
+            raise BagError(f'{path}: is missing; copy all files of the bag')
+        if not path.is_file():
             raise BagError(f'{path}: is no regular file; copy it to one')
-        if start_of(path, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
+        if first_bytes(path, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
             folder = self._open.enter_context(TemporaryDirectory(prefix='bag-'))
             plain = Path(folder) / path.stem
             if damage := inflate_file(path, plain):
                 self.problems.append(f'{path.name}: {damage}')
-        start = start_of(plain, 16)
+        start = first_bytes(plain, 16)
         if not start:
             raise BagError(f'{path}: holds nothing ({damage or "0 bytes"}); record it again')
         for magic, reader in READERS.items():
@@ -158,21 +158,18 @@ class Recording:
 
 
 def parse_metadata(text: str) -> tuple[list[str], list[Topic]]:
-    """Names of the files and topics of metadata.yaml of any version.
-
-    Raises ValueError when it is malformed.
-    """
+    """Names of the files, and topics, in a metadata.yaml of any version. Raises ValueError."""
     try:
         tree = load_yaml(text)['rosbag2_bagfile_information']
         names = [PurePath(str(file)).name for file in tree['relative_file_paths']]
         topics = []
         for entry in tree['topics_with_message_count']:
-            told = entry['topic_metadata']
-            qos = told.get('offered_qos_profiles') or ''
-            fields = told['name'], told['type'], told['serialization_format'], qos
+            topic = entry['topic_metadata']
+            qos = topic.get('offered_qos_profiles') or ''
+            fields = topic['name'], topic['type'], topic['serialization_format'], qos
             topics.append(make_topic(*fields, entry['message_count']))
     except KeyError as error:
         raise ValueError(f'it has no {short_line(str(error.args[0]))}') from None
     except (TypeError, AttributeError, OverflowError):
-        raise ValueError('its entries are not those of a bag') from None
+        raise ValueError('it does not describe a bag') from None
     return names, topics

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the camera sits on the robot, by the static transforms that a bag holds."""
+"""The lever arm of the camera from the static transforms of a bag."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ TOPIC = '/tf_static'
 
 
 def camera_place(bag: Bag, image_topic: str, odometry_topic: str) -> complex | None:
-    """Ahead + i left of the odometry's child frame, m, of the frame of the images; None where
-    static transforms do not connect these two.
+    """Camera position, ahead + i left, m, in the child frame of the odometry; None where static
+    transforms do not connect both frames.
     """
     topic = bag.topics.get(TOPIC)
     if topic is None or not decoding.can_decode(topic):
@@ -42,12 +42,12 @@ def camera_place(bag: Bag, image_topic: str, odometry_topic: str) -> complex | N
     base = _to_root(frames.get(odometry_topic, ''), parents)
     if len(frames) < 2 or camera[0] != base[0]:
         return None
-    ahead, left = np.linalg.solve(base[1], camera[1])[:2, 3].tolist()
-    return complex(ahead, left)
+    lever_arm = np.linalg.solve(base[1], camera[1])[:2, 3]
+    return complex(*lever_arm)
 
 
 def _links(message: object) -> dict[str, tuple[str, Array]]:
-    """By frame its parent, and the transform (4, 4) to that. Raises MessageError."""
+    """The parent of each frame, and the transform (4, 4) to it. Raises MessageError."""
     links = {}
     for part in message.transforms:  # type: ignore[attr-defined]
         moved, turned = part.transform.translation, part.transform.rotation
@@ -61,7 +61,7 @@ def _links(message: object) -> dict[str, tuple[str, Array]]:
 
 
 def _rotation(axis: Array, real: float) -> Array:
-    """The rotation (3, 3) of a quaternion of any length. Raises MessageError for none."""
+    """Rotation (3, 3) of a quaternion of any length but zero. Raises MessageError."""
     square = float(axis @ axis) + real**2
     if square == 0.0:
         raise MessageError('quaternion is zero')
@@ -71,7 +71,7 @@ def _rotation(axis: Array, real: float) -> Array:
 
 
 def _to_root(frame: str, parents: dict[str, tuple[str, Array]]) -> tuple[str, Array]:
-    """The root of a frame's tree, and the transform (4, 4) to it; a loop ends where it began."""
+    """The root of a frame's tree, and the transform (4, 4) to it; a loop ends at its start."""
     matrix, passed = np.eye(4), set[str]()
     while frame in parents and frame not in passed:
         passed.add(frame)

@@ -15,27 +15,27 @@ from sfa_localization.data.rejections import RejectionCounter
 from sfa_localization.data.run import Count
 
 CLOCK_JUMP_NS = 10_000_000_000
-"""A stamp that moved this much (10 s) more or less than the time of reception is a jump of the
-sender's clock: queues and networks delay a message by less."""
+"""A difference this large (10 s) between the steps of stamp and reception is a jump of the sender's
+clock: queues and networks delay a message by less."""
 
 
 class Item(NamedTuple):
-    """A message on its way: its stamp, its reception, and the value read from it."""
+    """A message: its stamp, its reception, and its value."""
 
     stamp_ns: int
     receive_ns: int
     value: Any
 
     def late_ns(self, before: Item) -> int:
-        """By how much the stamp moved more than the reception since one before."""
+        """Step of the stamp minus the step of the reception since a message before."""
         return self.stamp_ns - before.stamp_ns - (self.receive_ns - before.receive_ns)
 
     def continues(self, before: Item) -> bool:
-        """Whether stamps and receptions differ by about the same time from one before."""
+        """Whether stamp and reception have moved alike since a message before."""
         return abs(self.late_ns(before)) <= CLOCK_JUMP_NS
 
     def corrects(self, ahead: Item, before: Item | None) -> bool:
-        """Whether its stamp, earlier than that of one received before, is the likelier of both."""
+        """Whether its stamp is likelier than the later stamp of the previous message `ahead`."""
         if before is None or self.stamp_ns == ahead.stamp_ns:
             return self.stamp_ns < ahead.stamp_ns
         later = self.stamp_ns > before.stamp_ns
@@ -44,16 +44,15 @@ class Item(NamedTuple):
 
 @dataclass(eq=False)
 class Stream:
-    """One topic being read: the `bag` and its name, the used messages, the others by reason.
+    """One topic being read, with the number of used messages, and of skipped ones by reason.
 
-    `convert` makes a value of a message, or of its transform to the `frame`, where that is not
-    None. Messages of an opaque stream are not decoded: their value is None. In `strict` reading a
-    faulty message is an error, and without a usable one a `required` stream always is.
+    `convert` makes a value of a message, or of its transform to `frame`. Messages of an opaque
+    stream are not decoded: their value is None. `strict` raises for a faulty message; a `required`
+    stream must have a usable message.
 
-    Messages pass in strictly increasing order of stamp, each when the next one has come: a single
-    stamp that lies ahead of it is skipped, and so is a jump that the next one does not continue;
-    one that lasts is a clock that was set. After a clock was set back, messages are skipped until
-    it has caught up.
+    Messages pass in increasing order of stamp, each when the next one has come. A single stamp that
+    is ahead of the next is skipped, as is a jump that the next does not continue; a lasting jump is
+    a clock that was set. After a clock was set back, messages are skipped until it has caught up.
     """
 
     bag: Path
@@ -81,7 +80,7 @@ class Stream:
         self.skipped.add(reason)
 
     def push(self, item: Item) -> list[Item]:
-        """The message that can be used now, if any; one is held back: call `flush` at the end."""
+        """The message to be used now, if any; the latest is held back until `flush`."""
         waiting, last = self._waiting, self._last
         before = waiting or last
         if item.stamp_ns <= 0:
@@ -104,7 +103,7 @@ class Stream:
         return self._settled(waiting, None)
 
     def _settled(self, waiting: Item | None, following: Item | None) -> list[Item]:
-        """The message held back, where it continues the one before, or is continued."""
+        """The message held back, if it continues the last one or is continued by the following."""
         if waiting is None:
             return []
         continuing = waiting.continues(self._last) if self._last else True

@@ -26,7 +26,7 @@ STORAGES = ('mcap', 'sqlite3')
 
 
 class BagWriter:
-    """Context manager that writes one bag; the folder `path` appears only when all is written.
+    """Context manager that writes one bag; the folder `path` appears when all is written.
 
     `storage` is 'mcap' (chunks compressed with zstd) or 'sqlite3'. The same calls give the same
     bytes. Raises BagError when `path` exists or cannot be written.
@@ -47,12 +47,16 @@ class BagWriter:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             folder = TemporaryDirectory(prefix='.bag-', dir=self.path.parent)
             self._part = Path(stack.enter_context(folder)) / self.path.name
-            self._writer = _open_writer(self._part, self._storage)
+            plugin = StoragePlugin.MCAP if self._storage == 'mcap' else StoragePlugin.SQLITE3
+            self._writer = Writer(self._part, version=9, storage_plugin=plugin)
+            if self._storage == 'mcap':
+                self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+            self._writer.open()
             self._folder = stack.pop_all()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
-        # The error that ended the block is the cause; a failed write only follows from it.
+        # After an error in the block, a failed write is only its consequence.
         with self._folder, suppress(Exception) if kind else self._named():
             self._writer.__exit__(kind, *error)
             if kind is None:
@@ -60,12 +64,11 @@ class BagWriter:
 
     @contextmanager
     def _named(self) -> Iterator[None]:
-        """Raise errors of the file system and of the database as one that names the bag."""
+        """Turn any error into one that names the bag."""
         try:
             yield
         except Exception as error:
-            why = error.strerror if isinstance(error, OSError) else str(error)
-            why = why or type(error).__name__
+            why = getattr(error, 'strerror', None) or str(error) or type(error).__name__
             raise BagError(f'{self.path}: cannot be written: {why}') from None
 
     def image(
@@ -148,15 +151,6 @@ def blank(types: Typestore, kind: str) -> Any:
         return np.zeros(length, base[0]) if inner == Nodetype.BASE else []
 
     return types.types[kind](**{name: value(*field) for name, field in types.fielddefs[kind][1]})
-
-
-def _open_writer(path: Path, storage: str) -> Writer:
-    plugin = StoragePlugin.MCAP if storage == 'mcap' else StoragePlugin.SQLITE3
-    writer = Writer(path, version=9, storage_plugin=plugin)
-    if storage == 'mcap':
-        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    writer.open()
-    return writer
 
 
 def _place(pose: Any, values: Array) -> None:

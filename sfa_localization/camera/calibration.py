@@ -14,37 +14,36 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from sfa_localization.camera.calibration_files import CALIBRATION_TITLE, read_calibration
-from sfa_localization.camera.encodings import encode_png, read_image
+from sfa_localization.camera.encodings import read_image
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper, panorama_rays
 from sfa_localization.camera.settings import CalibrationConfig, LensCalibration
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.files import atomic_write, first_bytes
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.files import first_bytes
+from sfa_localization.data.geometry import Array, Complex, Mask
 from sfa_localization.data.run import Image
+from sfa_localization.data.sphere import rotation
 
-_RAYS = 360  # directions from the center in which edges are looked for
-_SEARCHED_PX = 640  # longer side at which circles are looked for: a soft rim is as narrow in all
-_COARSE_PX, _COARSE_STEP, _COARSE_RAYS = 160, 4, 48  # and at which circles are tried one by one
+_RAYS, _COARSE_RAYS = 360, 48  # directions from the center in which edges are searched
+_SEARCHED_PX, _COARSE_PX = 640, 160  # longer side of the image in the fine and the coarse search
+_COARSE_STEP = 4  # px between the centers of the coarse search
 _TOLERANCE = 0.012  # of the radius, from an edge to the circle that it supports
 _TRIALS = 400  # random circles; enough to find the rim among two thirds of wrong edges
 _ENOUGH_FOR_MOTION = 3  # images; the change between two is mostly noise
-# Beside a circle, as shares of its radius: beyond the tenth over which light falls off at a rim.
-_BESIDE = np.array([0.03, 0.06, 0.09])
-_CONTRAST = 0.06  # of the range of a cue: more than its noise, less than a dim scene beside the rim
-_RIM_SUPPORT, _HOLE_SUPPORT = 0.3, 0.6  # a rim may be cut off, a hole is whole
+_BESIDE = np.array([0.03, 0.06, 0.09])  # samples on both sides of a circle, over its radius
+_CONTRAST = 0.06  # of the range of a cue: more than its noise, less than a dim scene at the rim
+_RIM_SUPPORT, _HOLE_SUPPORT = 0.3, 0.6  # the border may cut off a rim, but no hole
 _CIRCLE = 'cx', 'cy', 'radius_min', 'radius_max'
 
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """A circle in an image: column and row of its center and radius in pixels.
+    """A circle in an image: column and row of its center, and radius, in pixels.
 
-    `support` is the share of the directions around it, of those in the image, in which an edge
-    lies on it.
+    `support` is the share of its visible directions in which an edge lies on the circle.
     """
 
     column: float
@@ -55,14 +54,14 @@ class Circle:
 
 @dataclass(frozen=True, slots=True)
 class MirrorCircles:
-    """The rim of a mirror or fisheye, and what is hidden in its middle (None: not found)."""
+    """The rim of a mirror or fisheye, and the hole in its middle, where there is any."""
 
     rim: Circle
     hole: Circle | None
 
 
 class ImageFiles(Sequence[Image]):
-    """Image files, each read anew when it is asked for: some kB may hold 200 MB of pixels."""
+    """Image files, each read on access: some kB may hold 200 MB of pixels."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._paths = paths
@@ -77,16 +76,19 @@ class ImageFiles(Sequence[Image]):
 def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
     """Find the rim of the mirror, and its hole, in images (H, W, 3) of one size.
 
-    All around the rim the image is dark just outside of it or, with several images taken while
-    driving, does not change: what stands out better. The same holds just inside of the hole.
-    Raises CameraError when no circle stands out.
+    Just outside of the rim the image is dark or, in several images taken while driving, does not
+    change; the cue that shows the circle more clearly counts. So does the image just inside of the
+    hole. Raises CameraError when no circle stands out.
     """
     rng = np.random.default_rng(seed)
     scale = min(_SEARCHED_PX / max(images[0].shape), 1.0)
     cues = _cues(images, scale)
-    by_support = attrgetter('support')
-    found = filter(None, [_find_circle(cue, rng, None) for cue in cues])
-    rim = max(found, key=by_support, default=None)
+
+    def clearest(rim: Circle | None) -> Circle | None:
+        circles = [circle for cue in cues if (circle := _find_circle(cue, rng, rim))]
+        return max(circles, key=attrgetter('support'), default=None)
+
+    rim = clearest(None)
     if rim is None:
         few = len(images) < _ENOUGH_FOR_MOTION
         more = f'{_ENOUGH_FOR_MOTION} or more, not {len(images)}' if few else 'others'
@@ -94,29 +96,28 @@ def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
             f'no mirror or fisheye stands out: take images ({more}) while driving in good light, '
             'or give --center and --radii'
         )
-    found = filter(None, [_find_circle(cue, rng, rim) for cue in cues])
-    hole = max(found, key=by_support, default=None)
+    hole = clearest(rim)
     return MirrorCircles(_enlarged(rim, scale), hole and _enlarged(hole, scale))
 
 
 def _enlarged(circle: Circle, scale: float) -> Circle:
-    """The circle of an image that was shrunk to a scale, in the image."""
+    """The circle in the image, from that in an image shrunk by `scale`."""
     column, row = (circle.column + 0.5) / scale - 0.5, (circle.row + 0.5) / scale - 0.5
     return Circle(column, row, circle.radius / scale, circle.support)
 
 
 def _cues(images: Sequence[Image], scale: float) -> list[Array]:
-    """What distinguishes the mirror from its surroundings (h, w), 0..255: brightness, change."""
-    brightness = squares = np.zeros(0)
+    """Brightness and, of enough images, change (h, w), 0..255: the mirror differs in them."""
+    sums = squares = np.zeros(0)
     for number, image in enumerate(images):
         gray = _scaled(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), scale)
         gray = np.asarray(cv2.GaussianBlur(gray, (0, 0), 1.0), float)
-        if number and gray.shape != brightness.shape:
+        if number and gray.shape != sums.shape:
             raise CameraError(
                 f'image {number + 1} differs in size from the first: give images of one camera'
             )
-        brightness, squares = (brightness + gray, squares + gray**2) if number else (gray, gray**2)
-    brightness = brightness / len(images)
+        sums, squares = (sums + gray, squares + gray**2) if number else (gray, gray**2)
+    brightness = sums / len(images)
     if len(images) < _ENOUGH_FOR_MOTION:
         return [brightness]
     variance = squares / len(images) - brightness**2
@@ -130,7 +131,7 @@ def _scaled(cue: Any, scale: float) -> Array:
 
 
 def _find_circle(cue: Array, rng: np.random.Generator, rim: Circle | None) -> Circle | None:
-    """The rim in a cue (h, w), or the hole about the middle of a rim that was found."""
+    """The rim in a cue (h, w), or the hole inside of a given rim."""
     low, high = np.quantile(cue, (0.02, 0.98))
     contrast = _CONTRAST * (high - low)
     if contrast < 1.0:
@@ -139,8 +140,7 @@ def _find_circle(cue: Array, rng: np.random.Generator, rim: Circle | None) -> Ci
     start = _coarse_circle(_scaled(cue, scale), contrast, rim, scale)
     circle = None
     for _ in range(2):
-        points = _edges(cue, start, contrast, rim is not None)
-        circle = _fit_circle(points, rng)
+        circle = _fit_circle(_edges(cue, start, contrast, rim is not None), rng)
         if circle is None:
             return None
         start = np.array([circle.column, circle.row, circle.radius])
@@ -151,7 +151,7 @@ def _find_circle(cue: Array, rng: np.random.Generator, rim: Circle | None) -> Ci
 
 
 def _coarse_circle(cue: Array, contrast: float, rim: Circle | None, scale: float) -> Array:
-    """Column, row, radius at scale 1 of the circle that the cue, shrunk to a scale, shows best."""
+    """Column, row, radius at scale 1 of the clearest circle in the cue shrunk by `scale`."""
     height, width = cue.shape
     if rim is None:
         middle = np.array([width, height]) / 2
@@ -162,43 +162,42 @@ def _coarse_circle(cue: Array, contrast: float, rim: Circle | None, scale: float
         steps = [np.linspace(-0.1, 0.1, 7) * reach] * 2
         radii = np.geomspace(max(0.05 * reach, 2.0), 0.6 * reach, 30)
     centers = middle + np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
-    best, found = -np.inf, np.array([*middle, radii[0]])
+    best, circle = -np.inf, np.array([*middle, radii[0]])
     for radius in radii:
         bright, dark = _sides(cue, centers, radius, _COARSE_RAYS, rim is not None)
-        seen = np.isfinite(dark).mean(1)
-        kept = seen >= _RIM_SUPPORT
+        visible = np.isfinite(dark).mean(1)
+        kept = visible >= _RIM_SUPPORT
         if not kept.any():
             continue
         bright, dark = bright[kept], dark[kept]
         level = np.nanmedian(dark, axis=1, keepdims=True) + contrast
         score = np.mean((bright > level) & (dark < level), 1) - np.mean(dark >= level, 1)
-        score /= seen[kept] + _RIM_SUPPORT  # what a border cuts off says nothing
+        score /= visible[kept] + _RIM_SUPPORT  # directions beyond the border do not count
         if score.max() > best:
             best = float(score.max())
-            found = np.array([*centers[kept][np.argmax(score)], radius])
-    return found / scale
+            circle = np.array([*centers[kept][np.argmax(score)], radius])
+    return circle / scale
+
+
+def _values(cue: Array, points: Complex, order: int) -> Array:
+    """Values of a cue at points, column + i row, by splines of an order; NaN outside of it."""
+    rows_columns = [points.imag, points.real]
+    return np.asarray(map_coordinates(cue, rows_columns, float, order=order, cval=np.nan))
 
 
 def _sides(cue: Array, centers: Array, radius: float, rays: int, hole: bool) -> tuple[Array, Array]:
-    """Means (N, rays) on both sides of circles about centers (N, 2), NaN outside of the image.
+    """Mean values (N, rays) on both sides of circles about centers (N, 2), NaN outside the image.
 
-    First that where a mirror shows something: inside of a rim, outside of a hole.
+    The side of the mirror's picture comes first: inside of a rim, outside of a hole.
     """
-    angles = np.arange(rays) * 2 * np.pi / rays
-    height, width = cue.shape
+    directions = np.exp(2j * np.pi * np.arange(rays) / rays)
     sides = []
     for factors in (1 - _BESIDE, 1 + _BESIDE):
-        reach = radius * factors[:, None, None]
-        columns = centers[:, 0, None] + reach * np.cos(angles)
-        rows = centers[:, 1, None] + reach * np.sin(angles)
-        inside = (columns >= 0) & (columns <= width - 1) & (rows >= 0) & (rows <= height - 1)
-        values = cue[
-            np.where(inside, rows, 0).astype(int), np.where(inside, columns, 0).astype(int)
-        ]
-        count = inside.sum(0)
-        sides.append(
-            np.where(count, np.where(inside, values, 0).sum(0) / np.maximum(count, 1), np.nan)
-        )
+        offsets = radius * factors[:, None, None] * directions
+        values = _values(cue, centers @ np.array([[1.0], [1j]]) + offsets, order=0)
+        inside = np.isfinite(values)
+        mean = np.nansum(values, axis=0) / np.maximum(inside.sum(0), 1)
+        sides.append(np.where(inside.any(0), mean, np.nan))
     return (sides[1], sides[0]) if hole else (sides[0], sides[1])
 
 
@@ -207,40 +206,38 @@ def _edges(cue: Array, start: Array, contrast: float, hole: bool) -> Array:
     bright, dark = (side[0] for side in _sides(cue, start[None, :2], start[2], _RAYS, hole))
     level = np.median(dark[np.isfinite(dark)]) if np.isfinite(dark).any() else np.inf
     factors = np.arange(0.85, 1.15, 0.25 / start[2])
-    angles = np.arange(_RAYS) * 2 * np.pi / _RAYS
-    columns = start[0] + start[2] * factors * np.cos(angles)[:, None]
-    rows = start[1] + start[2] * factors * np.sin(angles)[:, None]
-    height, width = cue.shape
-    inside = (columns >= 0) & (columns <= width - 1) & (rows >= 0) & (rows <= height - 1)
-    maps = columns.astype(np.float32), rows.astype(np.float32)
-    values = cv2.remap(cue.astype(np.float32), *maps, cv2.INTER_LINEAR)
-    above = (values > ((np.fmax(bright, level) + level) / 2)[:, None]) & inside
-    seen = (bright > level + contrast) & (dark < level + contrast)
+    directions = np.exp(2j * np.pi * np.arange(_RAYS) / _RAYS)
+    points = complex(*start[:2]) + start[2] * factors * directions[:, None]
+    values = _values(cue, points, order=1)
+    above = values > ((np.fmax(bright, level) + level) / 2)[:, None]
     if hole:
         index = np.argmax(above, axis=1)
-        found = seen & above.any(1) & (index > 0)
+        complete = index > 0
     else:
         index = factors.size - 1 - np.argmax(above[:, ::-1], axis=1)
-        found = seen & above.any(1) & (index < inside.sum(1) - 3)
-    picked = np.flatnonzero(found), index[found]
-    return np.column_stack([columns[picked], rows[picked]])
+        complete = index < np.isfinite(values).sum(1) - 3
+    clear = (bright > level + contrast) & (dark < level + contrast) & above.any(1)
+    edges = points[clear & complete, index[clear & complete]]
+    return np.column_stack([edges.real, edges.imag])
 
 
 def _fit_circle(points: Array, rng: np.random.Generator) -> Circle | None:
-    """Fit a circle to points (N, 2) of which many may be wrong; None with fewer than 8."""
+    """Fit a circle to points (N, 2) with many outliers (RANSAC); None with fewer than 8."""
     if len(points) < 8:
         return None
     best = np.zeros(len(points), bool)
     for _ in range(_TRIALS):
-        agree = _agree(points, _least_squares(points[rng.choice(len(points), 3, replace=False)]))
-        if agree.sum() > best.sum():
-            best = agree
+        circle = _least_squares(points[rng.choice(len(points), 3, replace=False)])
+        inliers = _inliers(points, circle)
+        if inliers.sum() > best.sum():
+            best = inliers
     for _ in range(3):
         if best.sum() < 3:
             return None
         circle = _least_squares(points[best])
-        best = _agree(points, circle)
-    return Circle(float(circle[0]), float(circle[1]), float(circle[2]), float(best.sum() / _RAYS))
+        best = _inliers(points, circle)
+    column, row, radius = circle.tolist()
+    return Circle(column, row, radius, float(best.sum() / _RAYS))
 
 
 def _least_squares(points: Array) -> Array:
@@ -252,7 +249,7 @@ def _least_squares(points: Array) -> Array:
     return np.array([a + origin[0], b + origin[1], np.sqrt(max(c + a**2 + b**2, 0.0))])
 
 
-def _agree(points: Array, circle: Array) -> NDArray[np.bool_]:
+def _inliers(points: Array, circle: Array) -> Mask:
     """Which points (N, 2) lie on a circle."""
     off = np.hypot(*(points - circle[:2]).T) - circle[2]
     return np.asarray(np.abs(off) < _TOLERANCE * circle[2])
@@ -264,11 +261,11 @@ def calibrate(
     config: CalibrationConfig,
     given: Mapping[str, Any],
 ) -> LensCalibration:
-    """The lens from a calibration file, or from a circle in images (H, W, 3), found there or given.
+    """The lens from a calibration file, or from the circle in images (H, W, 3).
 
-    `given` holds fields of LensCalibration that count as they are: those of the circle, of which
-    with a file the radii only limit what is visible, and others. Raises CameraError when this is
-    not enough.
+    `given` holds fields of LensCalibration that take precedence; its circle replaces that of the
+    images, and its radii limit what is visible of a lens from a file. Raises CameraError when this
+    is not enough.
     """
     if calibration_file is not None:
         used = {name: value for name, value in given.items() if name not in _CIRCLE[:2]}
@@ -279,9 +276,8 @@ def calibrate(
     fields = {'camera_model': config.model, 'image_width': width, 'image_height': height}
     if not given.keys() >= set(_CIRCLE):
         circles = find_circles(images)
-        hole, rim = circles.hole.radius if circles.hole else 0.0, circles.rim
-        found = (rim.column, rim.row, hole, rim.radius)
-        fields |= dict(zip(_CIRCLE, found, strict=True))
+        rim, hole = circles.rim, circles.hole.radius if circles.hole else 0.0
+        fields |= dict(zip(_CIRCLE, (rim.column, rim.row, hole, rim.radius), strict=True))
     fields |= given
     if config.model == 'fisheye':
         focal = float(fields['radius_max'] / np.radians(config.field_of_view / 2))
@@ -291,126 +287,102 @@ def calibrate(
             'no inner circle was found, which the polar model needs: give --center and --radii'
         )
     lens = LensCalibration.from_mapping(fields, 'calibration')
-    _require_inside(lens)
+    farthest = math.hypot(max(lens.cx, width - lens.cx), max(lens.cy, height - lens.cy))
+    if not (0 <= lens.cx <= width and 0 <= lens.cy <= height and lens.radius_max <= farthest):
+        raise CameraError(
+            f'a center at {lens.cx:g}x{lens.cy:g} with a rim of {lens.radius_max:g} pixels is not '
+            f'in an image of {width}x{height} pixels: correct --center or --radii'
+        )
     return lens
 
 
 def given_circle(center: Sequence[float] | None, radii: Sequence[float] | None) -> dict[str, Any]:
-    """Fields of a lens from its center (column, row) and radii (hole, rim) in pixels, or from one
-    of both. Raises CameraError.
+    """Fields of a lens from its center (column, row) and radii (hole, rim) in pixels, where they
+    are given. Raises CameraError.
     """
-    fields: dict[str, Any] = {}
-    for names, numbers in ((_CIRCLE[:2], center), (_CIRCLE[2:], radii)):
-        if numbers and (
-            len(numbers) != 2 or (numbers is radii and not 0 <= numbers[0] < numbers[1])
-        ):
-            raise CameraError('--center takes COLUMNxROW, --radii takes INNERxOUTER in pixels')
-        fields |= dict(zip(names, numbers or (), strict=False))
-    return fields
-
-
-def _require_inside(lens: LensCalibration) -> None:
-    column, row, width, height = lens.cx, lens.cy, lens.image_width, lens.image_height
-    farthest = math.hypot(max(column, width - column), max(row, height - row))
-    if not (0 <= column <= width and 0 <= row <= height and lens.radius_max <= farthest):
-        raise CameraError(
-            f'a center at {column:g}x{row:g} with a rim of {lens.radius_max:g} pixels is not in '
-            f'an image of {width}x{height} pixels: correct --center or --radii'
-        )
+    valid = len(center or (0, 0)) == 2 and len(radii or (0, 0)) == 2
+    if not valid or (radii and not 0 <= radii[0] < radii[1]):
+        raise CameraError('--center takes COLUMNxROW, --radii takes INNERxOUTER in pixels')
+    fields = dict(zip(_CIRCLE[:2], center or (), strict=False))
+    return fields | dict(zip(_CIRCLE[2:], radii or (), strict=False))
 
 
 _GREEN, _RED = (80, 220, 80), (60, 60, 255)
-_CHECK_WIDTH = 1200  # px: smaller images are framed, so that the labels of the panorama fit
+_CHECK_WIDTH = 1200  # px: the labels of a panorama of this width can be read
 _SIDES = {'FRONT': 0, 'LEFT': 90, 'BACK': 180, 'RIGHT': 270}
-_LABELS_DEG = 45  # azimuth at which elevations are named
-_STEP, _NEAR = 4, 0.999  # pixels among which the place of a label is looked for; its least cosine
+_LABELS_DEG = 45  # azimuth of the labels of elevations
+_STEP, _NEAR = 4, 0.999  # step of the search for the pixel of a label, px; its least cosine
 
 
 def check_image(image: Image, unwrapper: Unwrapper) -> Image:
-    """The raw image above its panorama, 1200 px wide: in both, directions red, and every ten
-    degrees above and below the horizon green.
+    """The raw image above its panorama, 1200 px wide, both with the front, left, back and right
+    in red, and elevations every ten degrees in green.
     """
-    strip = _wide(unwrapper(image), _CHECK_WIDTH)
-    rays = _wide(panorama_rays(unwrapper.panorama), _CHECK_WIDTH)
-    _draw(strip, rays)
-    raw = _wide(image, min(image.shape[1], _CHECK_WIDTH))
+    strip = _resized(unwrapper(image), _CHECK_WIDTH)
+    _draw(strip, _resized(panorama_rays(unwrapper.panorama), _CHECK_WIDTH))
+    raw = _resized(image, min(image.shape[1], _CHECK_WIDTH))
     height, width = raw.shape[:2]
+    camera = unwrapper.camera
     model = make_camera(
-        unwrapper.calibration, (height, width), unwrapper.panorama, unwrapper.camera.mount_rpy
+        unwrapper.calibration, (height, width), unwrapper.panorama, camera.mount_rpy
     )
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(float)
     _draw(raw, model.unproject(pixels.reshape(-1, 2)).reshape(height, width, 3))
-    left = (_CHECK_WIDTH - width) // 2
+    margin = (_CHECK_WIDTH - width) // 2
     framed = np.zeros((height + len(strip), _CHECK_WIDTH, 3), np.uint8)
-    framed[:height, left : left + width], framed[height:] = raw, strip
+    framed[:height, margin : margin + width], framed[height:] = raw, strip
     return framed
 
 
-def _wide(image: Any, width: int) -> Any:
+def _resized(image: Any, width: int) -> Any:
     """A copy of an image (H, W, 3) scaled to a width."""
     height = max(round(image.shape[0] * width / image.shape[1]), 1)
-    shrinks = width < image.shape[1]
-    return cv2.resize(
-        image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    )
+    method = cv2.INTER_AREA if width < image.shape[1] else cv2.INTER_LINEAR
+    return cv2.resize(image, (width, height), interpolation=method)
 
 
-def _draw(drawn: Image, rays: Array) -> None:
-    """Draw directions and elevations into an image whose pixels see rays (H, W, 3)."""
+def _draw(canvas: Image, rays: Array) -> None:
+    """Draw directions and elevations into an image whose pixels see the rays (H, W, 3)."""
     x, y, z = np.moveaxis(rays, -1, 0)
-    for elevation in range(-80, 90, 10):
-        above, width = z > np.sin(np.radians(elevation)), 2 if elevation else 3
-        drawn[_border(above, x, width)] = _GREEN
-    for seen in (x > 0, y > 0):
-        drawn[_border(seen, x)] = _RED
-    for elevation in range(-80, 90, 10):
-        name = f'{elevation:+d} deg' if elevation else 'HORIZON'
-        _write(drawn, name, rays, (_LABELS_DEG, elevation), _GREEN)
+    elevations = {k: f'{k:+d} deg' if k else 'HORIZON' for k in range(-80, 90, 10)}
+    for elevation in elevations:
+        border = _border(z > np.sin(np.radians(elevation)), x, 2 if elevation else 3)
+        canvas[border] = _GREEN
+    for half in (x > 0, y > 0):
+        canvas[_border(half, x)] = _RED
+    for elevation, name in elevations.items():
+        _write(canvas, name, rays, (_LABELS_DEG, elevation), _GREEN)
     for name, azimuth in _SIDES.items():
-        _write(drawn, name, rays, (azimuth, 0), _RED)
+        _write(canvas, name, rays, (azimuth, 0), _RED)
 
 
-def _border(inside: NDArray[np.bool_], seen: Array, width: int = 2) -> NDArray[np.bool_]:
-    """Mask (H, W) of where a region ends, beside pixels that see something."""
+def _border(region: Mask, visible: Array, width: int = 2) -> Mask:
+    """Mask (H, W) of the border of a region among pixels whose `visible` is no NaN."""
     square = np.ones((width, width), np.uint8)
-    border = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_GRADIENT, square)
-    visible = cv2.erode(np.isfinite(seen).astype(np.uint8), square)
-    return np.asarray((border > 0) & (visible > 0))
+    border = cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_GRADIENT, square)
+    inside = cv2.erode(np.isfinite(visible).astype(np.uint8), square)
+    return np.asarray((border > 0) & (inside > 0))
 
 
 def _write(
-    drawn: Image, text: str, rays: Array, toward: tuple[float, float], color: tuple[int, int, int]
+    canvas: Image, text: str, rays: Array, toward: tuple[float, float], color: tuple[int, int, int]
 ) -> None:
-    """Write a text where the image shows an azimuth and elevation (degrees), if it does."""
-    azimuth, elevation = np.radians(toward)
-    level = np.cos(elevation)
-    ray = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    """Write a text at the pixel of an azimuth and elevation (degrees), if the image shows it."""
+    ray = rotation(0.0, *np.radians([-toward[1], toward[0]]))[:, 0]
     likeness = np.nan_to_num(rays[::_STEP, ::_STEP] @ ray, nan=-1.0)
     place = np.unravel_index(np.argmax(likeness), likeness.shape)
     if likeness[place] < _NEAR:
         return
     font = cv2.FONT_HERSHEY_SIMPLEX
     (width, height), _ = cv2.getTextSize(text, font, 0.5, 1)
-    column = int(np.clip(_STEP * place[1] + 3, 2, max(drawn.shape[1] - width - 2, 2)))
-    row = int(np.clip(_STEP * place[0] - 3, height + 2, max(drawn.shape[0] - 4, height + 2)))
-    for ink, thickness in (((0, 0, 0), 3), (color, 1)):  # a black outline keeps it readable
-        cv2.putText(drawn, text, (column, row), font, 0.5, ink, thickness, cv2.LINE_AA)
+    column = int(np.clip(_STEP * place[1] + 3, 2, max(canvas.shape[1] - width - 2, 2)))
+    row = int(np.clip(_STEP * place[0] - 3, height + 2, max(canvas.shape[0] - 4, height + 2)))
+    for ink, thickness in (((0, 0, 0), 3), (color, 1)):  # with a black outline
+        cv2.putText(canvas, text, (column, row), font, 0.5, ink, thickness, cv2.LINE_AA)
 
 
-def require_own(path: Path) -> None:
-    """Raise CameraError for a file that is there, and no calibration that was written here."""
+def require_replaceable(path: Path) -> None:
+    """Raise CameraError for a file that is no calibration written here."""
     start = first_bytes(path)
     if start and not start.startswith(CALIBRATION_TITLE.encode()):
         raise CameraError(f'{path}: is no file of calibrate: give another name, or remove it')
-
-
-def write_calibration(path: Path, text: str) -> None:
-    """Write a calibration file, whole or not at all. Raises CameraError naming it."""
-    with atomic_write(path, CameraError) as file:
-        file.write(text.encode())
-
-
-def write_check(path: Path, image: Image) -> None:
-    """Write an image (H, W, 3) as PNG. Raises CameraError naming the file."""
-    with atomic_write(path, CameraError) as file:
-        file.write(encode_png(image))

@@ -1,16 +1,14 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration files: the package's own, and those of other tools.
+"""Calibration files: the package's native ones, and those of other tools.
 
-The package's own is YAML with the fields of `LensCalibration`. Of other tools: camera_info as YAML
-(also as printed by ``ros2 topic echo``, and camera_calibration's ost.yaml), what OpenCV's
-FileStorage writes (pinhole, fisheye, omnidir; YAML or XML), Kalibr's camchain, camodocal's MEI and
-KANNALA_BRANDT, stella_vslam, ORB-SLAM3, and OCamCalib's calib_results.txt.
+A native file is YAML with the fields of `LensCalibration`. Others: camera_info as YAML (as printed
+by ``ros2 topic echo``, or ost.yaml), OpenCV's FileStorage (pinhole, fisheye, omnidir; YAML or XML),
+Kalibr's camchain, camodocal, stella_vslam, ORB-SLAM3, and OCamCalib's calib_results.txt.
 """
 
 from __future__ import annotations
 
-import itertools
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
@@ -25,14 +23,12 @@ from sfa_localization.data.files import read_regular
 from sfa_localization.data.plain_yaml import load_yaml
 from sfa_localization.data.rejections import quoted, short_line
 
-_KNOWN = (
-    'known are camera_info, OpenCV, Kalibr, camodocal, stella_vslam and ORB-SLAM3 YAML, OpenCV '
+_SUPPORTED = (
+    'supported are camera_info, OpenCV, Kalibr, camodocal, stella_vslam and ORB-SLAM3 YAML, OpenCV '
     'XML, OCamCalib calib_results.txt, and what the command calibrate writes'
 )
-_OF_EVERY_CAMERA = (
-    *('camera_model', 'image_width', 'image_height', 'cx', 'cy', 'radius_min', 'radius_max'),
-    *('axis', 'mirrored'),
-)
+_OF_EVERY_CAMERA = ('camera_model', 'image_width', 'image_height', 'cx', 'cy', 'radius_min',
+                    'radius_max', 'axis', 'mirrored')  # fmt: skip
 _OF_MODEL = {
     'mirror': ('fx', 'fy', 'xi', 'distortion'),
     'fisheye': ('fx', 'fy', 'distortion'),
@@ -40,8 +36,7 @@ _OF_MODEL = {
     'polar': ('angle_min', 'angle_max'),
     'dual_fisheye': ('fx', 'fy', 'distortion', 'second_cx', 'second_cy', 'second_roll'),
 }
-LARGEST_FILE = 1 << 20
-"""Bytes of a calibration file: hundreds of times the largest."""
+_LARGEST_FILE = 1 << 20  # bytes: hundreds of times the largest calibration
 CALIBRATION_TITLE = '# Calibration of an omnidirectional camera'
 _HEAD = f"""\
 {CALIBRATION_TITLE}; parameters of omnicam_node that go with it:
@@ -49,14 +44,13 @@ _HEAD = f"""\
 #   mount_rpy: {{mount_rpy}}
 """
 
-# What programs call the same things; the first that is there counts.
+# Names that programs give to the same things; the first in a file counts.
 _PARTS = {'Camera', 'Camera1', 'cam0', 'mirror_parameters', 'distortion_parameters',
           'projection_parameters'}  # fmt: skip
 _MATRIX = ('camera_matrix', 'K', 'k', 'cameraMatrix', 'intrinsics')
 _FOCAL = (('fx', 'gamma1', 'mu'), ('fy', 'gamma2', 'mv'), ('cx', 'u0'), ('cy', 'v0'))
-_COEFFICIENTS = (
-    'distortion_coefficients', 'D', 'd', 'distCoeffs', 'dist_coeffs', 'distortion_coeffs',
-)  # fmt: skip
+_COEFFICIENTS = ('distortion_coefficients', 'D', 'd', 'distCoeffs', 'dist_coeffs',
+                 'distortion_coeffs')  # fmt: skip
 _SIZES = (('image_width', 'width', 'cols'), ('image_height', 'height', 'rows'))
 _KINDS = ('camera_model', 'model_type', 'model', 'type', 'distortion_model')
 _MIRRORS = {'mei', 'omni'}
@@ -82,30 +76,28 @@ def calibration_of(camera: CameraConfig) -> LensCalibration:
 
 
 def calibration_text(calibration: LensCalibration, mount_rpy: Sequence[float]) -> str:
-    """The package's own calibration file (YAML): every field that the camera model uses."""
+    """The native calibration file (YAML): every field that the camera model uses."""
     names = _OF_EVERY_CAMERA + _OF_MODEL.get(calibration.camera_model, ())
-    fields = {name: getattr(calibration, name) for name in names}
-    plain = {n: list(value) if isinstance(value, tuple) else value for n, value in fields.items()}
-    text = _HEAD.format(mount_rpy=list(mount_rpy))
-    return text + str(yaml.safe_dump(plain, sort_keys=False))
+    values = [getattr(calibration, name) for name in names]
+    plain = [list(value) if isinstance(value, tuple) else value for value in values]
+    fields = yaml.safe_dump(dict(zip(names, plain, strict=True)), sort_keys=False)
+    return _HEAD.format(mount_rpy=list(mount_rpy)) + str(fields)
 
 
 def read_calibration(path: Path) -> LensCalibration:
-    """Read a calibration file; radii that it does not name limit nothing.
+    """Read a calibration file; without radii in it, all of the image is visible.
 
-    Raises CameraError naming the file when it is missing, of an unknown kind, or of a camera
-    model that is not supported.
+    Raises CameraError naming the file when it is missing, or of an unknown kind or camera model.
     """
     try:
-        text = read_regular(path, LARGEST_FILE).decode('utf-8', errors='replace')
-    except OSError as error:
-        raise CameraError(f'{path}: {error.strerror or error}') from None
-    try:
+        text = read_regular(path, _LARGEST_FILE).decode('utf-8', errors='replace')
         fields = _from_ocam(text) if path.suffix.lower() == '.txt' else _from_names(text)
         return LensCalibration(**{'radius_min': 0.0, 'radius_max': 0.0, **fields})
+    except OSError as error:
+        raise CameraError(f'{path}: {error.strerror or error}') from None
     except (TypeError, ValueError, OverflowError) as error:
         raise CameraError(
-            f'{path}: no camera calibration ({short_line(str(error))}); {_KNOWN}'
+            f'{path}: no camera calibration ({short_line(str(error))}); {_SUPPORTED}'
         ) from None
     except (CameraError, ConfigError) as error:
         raise CameraError(f'{path}: {error}') from None
@@ -118,15 +110,9 @@ def _from_ocam(text: str) -> dict[str, Any]:
     if len(numbers) < 5 or int(numbers[0][0]) != len(numbers[0]) - 1:
         raise CameraError('not the five rows of OCamCalib calib_results.txt')
     (cy, cx), (height, width) = numbers[2], numbers[4]
-    return {
-        'camera_model': 'ocam',
-        'polynomial': tuple(numbers[0][1:]),
-        'affine': tuple(numbers[3]),
-        'cx': cx,
-        'cy': cy,
-        'image_width': int(width),
-        'image_height': int(height),
-    }
+    size = {'image_width': int(width), 'image_height': int(height)}
+    lens = {'polynomial': tuple(numbers[0][1:]), 'affine': tuple(numbers[3])}
+    return {'camera_model': 'ocam', 'cx': cx, 'cy': cy, **size, **lens}
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
@@ -146,12 +132,17 @@ def _from_names(text: str) -> dict[str, Any]:
         # A topic that is echoed ends each message with a document mark.
         content = _xml(text) if text[:1] == '<' else load_yaml(text, _Loader, first=True)
     except ValueError as error:
-        raise CameraError(f'{error}; {_KNOWN}') from None
+        raise CameraError(f'{error}; {_SUPPORTED}') from None
     if not isinstance(content, Mapping):
-        raise CameraError(f'no camera calibration; {_KNOWN}')
-    if 'camera_model' in content and not set(_MATRIX) & set(content):
-        return _from_own(content)
-    return _from_others(_flat(content))
+        raise CameraError(f'no camera calibration; {_SUPPORTED}')
+    if 'camera_model' not in content or set(_MATRIX) & set(content):
+        return _from_others(_flat(content))
+    model = content['camera_model']
+    missing = [name for name in ('cx', 'cy', *_OF_MODEL.get(model, ())) if name not in content]
+    if missing and model in _OF_MODEL:
+        raise CameraError(f'{", ".join(missing)} missing, which the {model} model needs')
+    LensCalibration.from_mapping(content, 'calibration')  # rejects unknown names
+    return dict(content)
 
 
 def _xml(text: str) -> dict[str, Any]:
@@ -164,29 +155,19 @@ def _xml(text: str) -> dict[str, Any]:
 
 
 def _flat(content: Mapping[Any, Any]) -> dict[str, Any]:
-    """Names and values of a file, with those of the parts that hold a camera's."""
-    found: dict[str, Any] = {}
+    """Names and values of a file, with those of its parts about the camera."""
+    named: dict[str, Any] = {}
     for key, value in content.items():
         part, _, name = str(key).partition('.')
         if part in _PARTS and isinstance(value, Mapping):
-            found = {**_flat(value), **found}
+            named = {**_flat(value), **named}
         else:
-            found.setdefault(name if part in _PARTS and name else str(key), value)
-    return found
-
-
-def _from_own(content: Mapping[str, Any]) -> dict[str, Any]:
-    """What `calibration_text` wrote, or a person in its place."""
-    model = content['camera_model']
-    missing = [name for name in ('cx', 'cy', *_OF_MODEL.get(model, ())) if name not in content]
-    if missing and model in _OF_MODEL:
-        raise CameraError(f'{", ".join(missing)} missing, which the {model} model needs')
-    LensCalibration.from_mapping(content, 'calibration')  # rejects unknown names
-    return dict(content)
+            named.setdefault(name if part in _PARTS and name else str(key), value)
+    return named
 
 
 def _from_others(named: Mapping[str, Any]) -> dict[str, Any]:
-    """Other programs' files: a camera's kind, focal lengths, center, distortion and size."""
+    """The lens in a file of another program."""
     kinds = {str(named[name]).lower() for name in _KINDS if name in named}
     if 'equirectangular' in kinds:
         return {'camera_model': 'equirectangular'}
@@ -219,12 +200,12 @@ def _from_others(named: Mapping[str, Any]) -> dict[str, Any]:
         return {'camera_model': 'fisheye', **lens}
     if has_mirror:
         return {'camera_model': 'mirror', 'xi': _required({'xi': xi}, 'xi'), **lens}
-    # A lens without a mirror shows the world as it is, and looks where it is pointed.
+    # A pinhole camera: not mirrored, and pointed forward.
     return {'camera_model': 'mirror', 'xi': 0.0, 'mirrored': 'no', 'axis': 'forward', **lens}
 
 
 def _distortion(named: Mapping[str, Any], kinds: set[str], fisheye: bool) -> tuple[float, ...]:
-    """The four coefficients, none where all are 0. They must be there, but for a plain pinhole."""
+    """The four coefficients, none where all are 0; only a plain pinhole may omit them."""
     names = ('k1', 'k2', 'k3', 'k4') if fisheye else ('k1', 'k2', 'p1', 'p2')
     names = ('k2', 'k3', 'k4', 'k5') if fisheye and 'k5' in named else names  # camodocal's
     if set(_COEFFICIENTS) & set(named):
@@ -240,21 +221,21 @@ def _distortion(named: Mapping[str, Any], kinds: set[str], fisheye: bool) -> tup
 
 def _size(named: Mapping[str, Any]) -> list[int]:
     """Columns and rows, 0 where they are not given."""
-    both = _given(named, 'resolution')
-    if not both and set(itertools.chain(*_SIZES)) & set(named):
-        both = [_required(named, *names) for names in _SIZES]
-    return [int(number) for number in both or (0, 0)]
+    size = _given(named, 'resolution')
+    if not size and any(_given(named, *names) for names in _SIZES):
+        size = [_required(named, *names) for names in _SIZES]
+    return [int(number) for number in size or (0, 0)]
 
 
 def _given(named: Mapping[str, Any], *names: str) -> list[float]:
-    """The numbers under the first of the names that is there; none where there is none."""
+    """The numbers of the first of the names in the file; none without any of them."""
     return next((_numbers(named[name]) for name in names if name in named), [])
 
 
 def _required(named: Mapping[str, Any], *names: str) -> float:
     numbers = _given(named, *names)
     if len(numbers) != 1:
-        raise CameraError(f'no number {" or ".join(names)} is given; {_KNOWN}')
+        raise CameraError(f'no number {" or ".join(names)} is given; {_SUPPORTED}')
     return numbers[0]
 
 

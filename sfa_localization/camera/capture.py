@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images from a V4L2 device, a video file or a folder, and a watch over the camera.
+"""Images from a V4L2 device, a video file or a folder.
 
-A camera that disconnects, goes silent or repeats its last image is closed and opened again,
-with pauses that double. Independent of ROS; time is that of the steady clock.
+A camera that disconnects, goes silent or repeats its last image is opened again, after pauses that
+double. Independent of ROS; time is that of the steady clock.
 """
 
 from __future__ import annotations
@@ -24,35 +24,33 @@ from sfa_localization.camera.encodings import read_image
 from sfa_localization.camera.settings import CaptureConfig
 from sfa_localization.camera.watch import FROZEN_S, FrozenWatch
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.files import is_regular
 from sfa_localization.data.run import Image
 
 logger = logging.getLogger(__name__)
 
 _SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.ppm', '.pgm', '.tif', '.tiff', '.webp')
 _USUAL_RATE_HZ = 10.0  # of a folder, and of a video that names none
-_OPENING_S = 10.0  # devices may take so long
-_IDLE_PAUSE_S = 0.02  # between questions whether images are wanted: shorter than a frame
-_REOPEN_FIRST_S = 0.5  # pause before a source is reopened: a USB camera needs it to come back
-_REOPEN_LONGEST_S = 30.0  # pauses double up to this, so that a camera is found soon after repair
+_OPENING_S = 10.0  # a device may need this long to open
+_IDLE_PAUSE_S = 0.02  # of a file while no image is wanted: shorter than a frame
+_REOPEN_FIRST_S, _REOPEN_LONGEST_S = 0.5, 30.0  # pauses before a source is reopened; they double
 
 
-Images = Generator[Image | CameraError, None, None]
-"""Images (H, W, 3) uint8 BGR in order, with the errors of those that are unusable."""
+CapturedImages = Generator[Image | CameraError, None, None]
+"""Images (H, W, 3) uint8 BGR in order; errors in place of unusable ones."""
 
 
 class Source(NamedTuple):
-    """An opened source: whether it is `live`, as a device and no file is, and its images.
+    """An opened source and its images; a device is `live`, a file is not.
 
-    A live one raises CameraError when there will be no more. Closing the images closes it.
+    At the end of its images a live source raises CameraError. Closing the images closes it.
     """
 
     live: bool
-    images: Images
+    images: CapturedImages
 
 
 def opener(config: CaptureConfig) -> Callable[[], Source]:
-    """A function that opens the source of the parameters. Raises CameraError without a source."""
+    """A function that opens the configured source. Raises CameraError where none is configured."""
     if config.source == 'topic':
         raise CameraError('images from a topic need no source to be opened')
     if not config.source_path:
@@ -81,12 +79,13 @@ def _device(config: CaptureConfig) -> Source:
 def _video(config: CaptureConfig) -> Source:
     """A video file, at its own rate or another."""
     path = config.source_path
-    # Asked first: a pipe never ends, and of a missing file OpenCV would warn on its own.
-    capture = cv2.VideoCapture(path) if is_regular(path) else None
+    # A pipe would never end, and OpenCV would print a warning about a missing file.
+    capture = cv2.VideoCapture(path) if os.path.isfile(path) else None
     if capture is None or not capture.isOpened():
         raise CameraError(f'video {path} is missing, or of a kind OpenCV cannot read')
-    own = capture.get(cv2.CAP_PROP_FPS)
-    rate_hz = config.source_rate or (own if 0.1 < own < 1000 else _USUAL_RATE_HZ)
+    recorded_hz = capture.get(cv2.CAP_PROP_FPS)
+    usual_hz = recorded_hz if 0.1 < recorded_hz < 1000 else _USUAL_RATE_HZ
+    rate_hz = config.source_rate or usual_hz
     return Source(False, _paced(_frames(capture), rate_hz))
 
 
@@ -108,14 +107,14 @@ def _read(path: Path) -> Image | CameraError:
         return error
 
 
-def _frames(capture: cv2.VideoCapture, at_end: str = '') -> Images:
-    """What OpenCV captures; the end raises CameraError where it should not come."""
+def _frames(capture: cv2.VideoCapture, at_end: str = '') -> CapturedImages:
+    """Captured images; the end of them raises CameraError with the text `at_end`, if any."""
     try:
         while True:
             done, image = capture.read()
             if not done or image is None:
                 break
-            gray = image.ndim == 2 or image.shape[2] == 1  # some devices deliver it
+            gray = image.ndim == 2 or image.shape[2] == 1
             yield np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if gray else image, np.uint8)
         if at_end:
             raise CameraError(at_end)
@@ -123,7 +122,7 @@ def _frames(capture: cv2.VideoCapture, at_end: str = '') -> Images:
         capture.release()
 
 
-def _paced(images: Iterable[Image | CameraError], rate_hz: float) -> Images:
+def _paced(images: Iterable[Image | CameraError], rate_hz: float) -> CapturedImages:
     """The images at a rate; a reader that is late does not catch up."""
     due = time.monotonic()
     for image in images:
@@ -135,9 +134,8 @@ def _paced(images: Iterable[Image | CameraError], rate_hz: float) -> Images:
 
 @dataclass(frozen=True, slots=True)
 class FeedStatus:
-    """How a feed is: new, opening, running, lost (will be opened again) or ended.
-
-    `lost` counts how often it was lost.
+    """State of a feed: new, opening, running, lost (to be reopened) or ended; `lost` counts the
+    losses.
     """
 
     state: str = 'new'
@@ -146,11 +144,11 @@ class FeedStatus:
 
 
 class Feed:
-    """Reads a source in a thread of its own and opens it again when it fails.
+    """Reads a source in a thread, and opens it again when it fails.
 
-    `deliver` takes each image and `reject` the reason why one is unusable, both in that thread.
-    Files wait while `wanted` returns False. `check` must be called now and then from elsewhere:
-    only there a read that never returns can be noticed.
+    The thread calls `deliver` with each image, and `reject` with the reason why one is unusable.
+    Files wait while `wanted` returns False. Call `check` regularly from another thread: it detects
+    a read that never returns.
     """
 
     def __init__(
@@ -171,12 +169,14 @@ class Feed:
         self._frozen = FrozenWatch()
         self._thread: threading.Thread | None = None
 
-    def start(self) -> None:
-        """Open the source and deliver images until `stop`."""
-        self._begin(pause=False)
+    def start(self, pause: bool = False) -> None:
+        """Open the source, at once or after a pause, and deliver images until `stop`."""
+        self._deadline_s = np.inf
+        self._thread = threading.Thread(target=self._run, args=(pause,), daemon=True)
+        self._thread.start()
 
     def stop(self) -> None:
-        """Deliver nothing more; a read that hangs is left behind."""
+        """Deliver nothing more; a read that hangs is abandoned."""
         self._stopped.set()
         if self._thread is not None:
             self._thread.join(timeout=1.0)
@@ -189,13 +189,8 @@ class Feed:
         """Abandon an opening or a read that hangs; return the status."""
         if time.monotonic() > self._deadline_s and not self._stopped.is_set():
             self._lose(f'silent for {self.config.silence_timeout:g} s')
-            self._begin(pause=True)
+            self.start(pause=True)
         return self._status
-
-    def _begin(self, pause: bool) -> None:
-        self._deadline_s = np.inf
-        self._thread = threading.Thread(target=self._run, args=(pause,), daemon=True)
-        self._thread.start()
 
     def _lose(self, problem: str) -> None:
         self._status = FeedStatus('lost', problem, self._status.lost + 1)
@@ -204,7 +199,7 @@ class Feed:
         self._status = FeedStatus(state, '', self._status.lost)
 
     def _goes_on(self) -> bool:
-        """Whether the calling thread is the feed's, and not one that was abandoned or stopped."""
+        """Whether the calling thread is neither abandoned nor stopped."""
         return threading.current_thread() is self._thread and not self._stopped.is_set()
 
     def _run(self, pause: bool) -> None:
@@ -214,14 +209,14 @@ class Feed:
             try:
                 self._read_all()
                 return
-            except Exception as error:  # whatever it is, the camera is to be opened again
+            except Exception as error:  # any failure reopens the camera
                 if not self._goes_on():
                     return
                 self._lose(self._problem(error))
             self._back_off()
 
     def _problem(self, error: Exception) -> str:
-        """What went wrong; an error that no camera causes is a defect, and logged as one."""
+        """Describe an error; one that no camera causes is logged as a defect."""
         if isinstance(error, (CameraError, cv2.error, OSError)):
             return str(error)
         text = f'internal error: {type(error).__name__}'
@@ -235,18 +230,18 @@ class Feed:
         self._stopped.wait(pause)
 
     def _read_all(self) -> None:
-        """Open, and read to the end; raises CameraError when the source has to be opened again."""
+        """Open, and read to the end. Raises CameraError when the source must be reopened."""
         self._deadline_s = time.monotonic() + _OPENING_S + self.config.silence_timeout
         if self._status.state == 'new':
             self._set_state('opening')
         source = self._open()
         try:
-            while self._goes_on() and self._read_one(source):
+            while self._goes_on() and self._read_next(source):
                 pass
         finally:
             source.images.close()
 
-    def _read_one(self, source: Source) -> bool:
+    def _read_next(self, source: Source) -> bool:
         """Deliver one image; False at the end."""
         silence = self.config.silence_timeout if source.live else np.inf
         self._deadline_s = time.monotonic() + silence
@@ -266,7 +261,7 @@ class Feed:
             if self._status.state == 'running':
                 self._pause_s = _REOPEN_FIRST_S
             self._set_state('running')
-        # The device repeats its last image, perhaps also when it was opened again.
+        # A device may repeat its last image even after it was reopened.
         if source.live and self._frozen.frozen_for_s():
             raise CameraError(f'the last image has been repeated for {FROZEN_S:g} s')
         self._deliver(image)

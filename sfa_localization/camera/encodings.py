@@ -8,8 +8,7 @@ their significant bits, an alpha channel is dropped, gray becomes three equal ch
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.errors import CameraError, MessageError
+from sfa_localization.data.errors import CameraError
 from sfa_localization.data.files import read_regular
 from sfa_localization.data.run import Image
 
@@ -57,24 +56,19 @@ _LAYOUTS |= dict.fromkeys(('uyvy', 'yuv422'), _Layout(2, code=cv2.COLOR_YUV2BGR_
 _LAYOUTS |= dict.fromkeys(('yuyv', 'yuv422_yuy2'), _Layout(2, code=cv2.COLOR_YUV2BGR_YUY2))
 _LAYOUTS['nv12'] = _Layout(1, code=cv2.COLOR_YUV2BGR_NV12, rows=(3, 2))
 _LAYOUTS['nv21'] = _Layout(1, code=cv2.COLOR_YUV2BGR_NV21, rows=(3, 2))
-_SENSOR_BITS = (10, 12, 14, 16)  # of the pixels of cameras that send two bytes for each
+_SENSOR_BITS = (10, 12, 14, 16)  # depths of pixels that are sent as two bytes
 _LARGEST_FILE = 1 << 28  # bytes of an image file
 ENCODINGS = tuple(_LAYOUTS)
 """The encodings that `decode_image` understands, in lower case."""
 
 
 def decode_image(
-    data: Any,
-    height: int,
-    width: int,
-    step: int,
-    encoding: str,
-    is_bigendian: bool = False,
+    data: Any, height: int, width: int, step: int, encoding: str, is_bigendian: bool = False
 ) -> Image:
     """Decode raw image data, as in ``sensor_msgs/Image``, to BGR (height, width, 3) uint8.
 
-    `data` is any buffer of bytes, `step` the bytes from one row to the next. The result may be
-    a read-only view of `data`. Raises CameraError with the reason in a few words.
+    `data` is any buffer of bytes, `step` the bytes per row. The result may be a read-only view of
+    `data`. Raises CameraError with the reason in a few words.
     """
     layout = _LAYOUTS.get(encoding.lower())
     if layout is None:
@@ -101,13 +95,12 @@ def _bytes(data: Any) -> NDArray[np.uint8]:
 
 
 def _to_8_bits(words: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """The upper 8 of the significant bits, which no message names: as many as the image needs.
+    """The upper 8 of the significant bits: those of the smallest depth that holds the image.
 
-    Of each image alone, so that training and nodes see the same. Fewer than the 10 of the coarsest
-    sensors it never has: an image of a few levels is dark.
+    No message names the depth. Each image is judged alone, so that training and nodes agree.
     """
-    need = int(words.max(initial=0)).bit_length()
-    bits = next(bits for bits in _SENSOR_BITS if need <= bits)
+    needed = int(words.max(initial=0)).bit_length()
+    bits = next(bits for bits in _SENSOR_BITS if needed <= bits)
     return (words >> (bits - 8)).astype(np.uint8)
 
 
@@ -122,9 +115,8 @@ def _checked(function: Callable[..., Any], *arguments: Any) -> Any:
 def decode_compressed(data: Any, format: str = '') -> Image:
     """Decode a JPEG, PNG, BMP, PNM, TIFF or WebP file to BGR (H, W, 3) uint8.
 
-    `format` is that of ``sensor_msgs/CompressedImage``; it matters only for a Bayer mosaic that
-    was compressed as it is. A truncated JPEG is rejected, because OpenCV would fill it with gray.
-    Raises CameraError with the reason in a few words.
+    `format` is that of ``sensor_msgs/CompressedImage``; only a compressed Bayer mosaic needs it. A
+    truncated JPEG is rejected: OpenCV would fill it with gray. Raises CameraError.
     """
     if 'compresseddepth' in format.lower():
         raise CameraError('a depth image is no camera image')
@@ -152,23 +144,21 @@ def read_image(path: Path | str) -> Image:
     """Read an image file as BGR (H, W, 3) uint8. Raises CameraError naming it."""
     try:
         return decode_compressed(read_regular(path, _LARGEST_FILE))
-    except OSError as error:
-        raise CameraError(f'{path}: {error.strerror or error}') from None
-    except CameraError as error:
-        raise CameraError(f'{path}: {error}') from None
+    except (OSError, CameraError) as error:
+        raise CameraError(f'{path}: {getattr(error, "strerror", None) or error}') from None
 
 
 def encode_jpeg(image: Image, quality: int) -> bytes:
     """Encode a BGR image (H, W, 3) as JPEG of `quality` 1..100."""
-    return _encoded('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
+    return _encoded('.jpg', image, cv2.IMWRITE_JPEG_QUALITY, int(quality))
 
 
 def encode_png(image: Image) -> bytes:
     """Encode a BGR image (H, W, 3) as PNG, without loss."""
-    return _encoded('.png', image, [])
+    return _encoded('.png', image)
 
 
-def _encoded(suffix: str, image: Image, options: list[int]) -> bytes:
+def _encoded(suffix: str, image: Image, *options: int) -> bytes:
     done, buffer = _checked(cv2.imencode, suffix, image, options)
     if not done:
         raise CameraError(f'an image of shape {image.shape} cannot be written as {suffix}')
@@ -176,21 +166,11 @@ def _encoded(suffix: str, image: Image, options: list[int]) -> bytes:
 
 
 def read_raw(message: Any) -> Image:
-    """Image (H, W, 3) uint8 BGR of an Image. Raises MessageError."""
+    """Image (H, W, 3) uint8 BGR of a ``sensor_msgs/Image``. Raises CameraError."""
     size = message.height, message.width, message.step
-    with _named_for_messages():
-        return decode_image(message.data, *size, message.encoding, bool(message.is_bigendian))
+    return decode_image(message.data, *size, message.encoding, bool(message.is_bigendian))
 
 
 def read_compressed(message: Any) -> Image:
-    """Image (H, W, 3) uint8 BGR of a CompressedImage. Raises MessageError."""
-    with _named_for_messages():
-        return decode_compressed(message.data, message.format)
-
-
-@contextmanager
-def _named_for_messages() -> Iterator[None]:
-    try:
-        yield
-    except CameraError as error:
-        raise MessageError(str(error)) from None
+    """Image (H, W, 3) uint8 BGR of a ``sensor_msgs/CompressedImage``. Raises CameraError."""
+    return decode_compressed(message.data, message.format)

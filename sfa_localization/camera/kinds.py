@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which kind of camera took images, from the images alone, and how to describe it."""
+"""The kind of a camera, guessed from its images, and the parameters that describe it."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image, Run
+from sfa_localization.data.statistics import evenly
 
 PANORAMA, EQUIRECTANGULAR, ORDINARY = 'panorama', 'equirectangular', 'ordinary camera'
 MIRROR, FISHEYE, DUAL_FISHEYE = 'mirror', 'fisheye', 'dual fisheye'
@@ -29,60 +30,53 @@ _ENTRIES = {
     EQUIRECTANGULAR: 'camera_model: equirectangular',
     PANORAMA: 'camera_model: panorama',
 }
-# Of an unrolled circle; the inner third shows the robot or the camera itself.
-_RADII, _ANGLES, _INNER = 30, 400, 10
-# Two views side by side are as alike as 1, or 0.5 where they are shifted by parallax, up to such a
-# share of their width; what lies opposite in a panorama by 0.1.
+_RADII, _ANGLES, _INNER = 30, 400, 10  # of an unrolled circle; the inner third shows the robot
+# Views side by side correlate by 1, or 0.5 when shifted by parallax, up to a share of their width;
+# opposite parts of a panorama by 0.1.
 _SAME, _PARALLAX = 0.35, 0.1
-_SAMPLES = 16  # images of a drive that are looked at
+_SAMPLES = 16  # images of a drive that are checked
 
 
 @dataclass(frozen=True, slots=True)
 class CameraKind:
-    """The kind of camera of images of a size, and what was `seen` that shows it."""
+    """The kind of camera of images of a size, and the `evidence` for it."""
 
     name: str
+    evidence: str
     width: int
     height: int
-    seen: str
 
     def __str__(self) -> str:
-        return f'{self.width}x{self.height}, {self.name}: {self.seen}'
+        return f'{self.width}x{self.height}, {self.name}: {self.evidence}'
 
     @property
     def is_panorama(self) -> bool:
-        """Whether the images show all around as columns."""
+        """Whether the columns of an image are azimuths."""
         return self.name in (PANORAMA, EQUIRECTANGULAR)
 
     @property
     def shows_turns(self) -> bool:
-        """Whether a turn of the robot shifts the images, once they are unrolled."""
+        """Whether a turn of the robot shifts the unrolled images."""
         return self.is_panorama or self.name in (MIRROR, FISHEYE)
 
     @property
     def lack(self) -> str:
-        """Why it cannot be used; '' for nothing."""
+        """Why it cannot be used; '' if it can."""
         if self.name not in (ORDINARY, STEREO):
             return ''
         return (
-            'the images do not show all directions: an omnidirectional camera is needed (one it '
-            'is all the same: describe it with calibration_file)'
+            'the images do not show all directions: an omnidirectional camera is needed (if it is '
+            'one all the same, describe it with calibration_file)'
         )
 
     def entry(self, bag: str) -> str:
-        """The parameter that describes the camera of a bag to omnicam_node; '' if none does."""
+        """The parameter of omnicam_node that describes the camera of a bag; '' if none does."""
         needed = self.name in _ENTRIES and not looks_like_panorama(self.height, self.width)
         return _ENTRIES[self.name].format(bag=bag) if needed else ''
 
 
-def kind_of(samples: Sequence[Image], width: int, height: int) -> CameraKind:
-    """The kind of camera that took images (H, W, 3) of one size, of which these are small."""
-    name, seen = guess_geometry(samples)
-    return CameraKind(name, width, height, seen)
-
-
 def guess_geometry(samples: Sequence[Image]) -> tuple[str, str]:
-    """The name of the kind, and what shows it."""
+    """The name of the kind of camera of images (H, W, 3), and the evidence for it."""
     height, width = samples[0].shape[:2]
     ratio, twice = f'{width / height:.1f} times as wide as high', abs(width / height - 2) < 0.02
     closes = width > height and _closes(samples)
@@ -104,11 +98,11 @@ def guess_geometry(samples: Sequence[Image]) -> tuple[str, str]:
     return ORDINARY, 'no circle, and edges that do not go on at the other side'
 
 
-def require_one_view(runs: Sequence[Run]) -> None:
-    """Raises CameraError for drives whose panoramas are two views side by side."""
+def require_single_view(runs: Sequence[Run]) -> None:
+    """Raise CameraError for drives whose panoramas are two views side by side."""
     for run in runs:
-        at = np.unique(np.linspace(0, len(run.panoramas) - 1, _SAMPLES).astype(int))
-        samples = [run.panoramas.read(k, k + 1)[0] for k in at.tolist()]
+        rows = evenly(len(run.panoramas), _SAMPLES).tolist()
+        samples = [run.panoramas.read(row, row + 1)[0] for row in rows]
         if not _closes(samples) and _same_twice(samples):
             raise CameraError(
                 f'{run.name}: the images are two views side by side, or show a place that looks '
@@ -117,7 +111,7 @@ def require_one_view(runs: Sequence[Run]) -> None:
 
 
 def unrolled(image: Image) -> Image:
-    """An image in which a turn of the robot is a shift: a circle, unrolled about its center."""
+    """A circular image, unrolled so that a turn shifts its columns; others as they are."""
     height, width = image.shape[:2]
     if looks_like_panorama(height, width) or abs(width / height - 2) < 0.02:
         return image
@@ -134,14 +128,14 @@ def _circles(samples: Sequence[Image]) -> MirrorCircles | None:
 
 
 def _closes(samples: Sequence[Image]) -> bool:
-    """Whether the first column goes on where the last one ends: more than a half turn away."""
+    """Whether the first column continues the last one, by the median differences of columns."""
     gray = np.stack([sample.mean(-1) for sample in samples])
 
-    def differs(columns: int) -> Array:
+    def change(columns: int) -> Array:
         return np.asarray(np.abs(gray - np.roll(gray, columns, axis=2)).mean((0, 1)))
 
-    near, far = np.median(differs(1)), np.median(differs(gray.shape[2] // 2))
-    return bool(differs(1)[0] < np.sqrt(near * far))
+    neighbors, opposite = change(1), change(gray.shape[2] // 2)
+    return bool(neighbors[0] < np.sqrt(np.median(neighbors) * np.median(opposite)))
 
 
 def _same_twice(samples: Sequence[Image]) -> bool:

@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Omnidirectional camera models with one interface: ray to pixel, and pixel to ray.
 
-A lens maps between unit rays (N, 3) of its optical frame (x along columns, y along rows, z along
-the axis into the scene) and pixels (N, 2) as column, row of the calibrated image, pixel centers at
-integers. What a lens cannot see is NaN. Radii are measured from its `center`, where it has one.
-`CameraModel` mounts a lens on the robot.
+A lens maps unit rays (N, 3) of its optical frame (x along columns, y along rows, z into the scene)
+to pixels (N, 2), column and row of the calibrated image with centers at integers, and back; NaN
+where it sees nothing. `CameraModel` mounts a lens on the robot.
 """
 
 from __future__ import annotations
@@ -20,13 +19,11 @@ from numpy.polynomial import Polynomial
 from sfa_localization.camera.settings import UNCALIBRATED, LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.sphere import rotation
+from sfa_localization.data.sphere import Sphere, rotation
 
-_LEAST_AFFINE = 1e-3  # determinant of an affine part: 1 for square pixels; at 0 they lie on a line
+_LEAST_AFFINE = 1e-3  # determinant of the affine part: 1 for square pixels, 0 if singular
 _WIDEST_PLANE = 20.0  # radius in the plane of a mirror up to which its distortion is inverted
-_SAMPLES = 2048  # of a curve that is inverted, before Newton's method
-_NEWTON_STEPS = 3
-_LINEAR = (0.0,) * 4  # coefficients of no distortion
+_SAMPLES, _NEWTON_STEPS = 2048, 3  # inversion of a curve: interpolated, then refined
 
 
 class Curve(NamedTuple):
@@ -37,9 +34,8 @@ class Curve(NamedTuple):
 
 
 def increasing(f: Callable[[Array], Array], df: Callable[[Array], Array], limit: float) -> Curve:
-    """A smooth y = f(x), f(0) = 0, with derivative df, where it increases from 0 up to a limit.
-
-    Raises CameraError where it does not increase at all.
+    """A smooth y = f(x) with f(0) = 0 and derivative df, from 0 up to where it stops to increase,
+    at most up to `limit`. Raises CameraError where it does not increase at 0.
     """
     x = np.linspace(0.0, limit, _SAMPLES)
     falling = np.flatnonzero(df(x) <= 0.0)
@@ -74,13 +70,13 @@ def _polar(plane: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class RadialLens:
-    """Every lens about one center: rays meet a plane, which is bent, sheared and scaled to pixels.
+    """A lens with one center: rays meet a plane, which is distorted and scaled to pixels.
 
     With `xi` it is the unified model of C. Mei and P. Rives, ICRA 2007 (OpenCV's omnidir, Kalibr's
-    omni): a ray (x, y, z) meets the plane at (x, y) / (z + xi). Central mirrors have 0 < xi <= 1;
-    xi = 0 is a pinhole camera. Without, it meets the plane at its angle (rad) from the axis.
-    `bend` maps the radius there, None where it stays, and `tangential` holds p1 and p2; then pixels
-    are focal * (affine @ plane) + center.
+    omni): a ray (x, y, z) meets the plane at (x, y) / (z + xi). Central mirrors have 0 < xi <= 1; a
+    pinhole camera has xi = 0. Without `xi` the radius in the plane is the angle (rad) from the
+    axis. `bend` distorts the radius, `tangential` holds p1 and p2, and pixels are
+    focal * (affine @ plane) + center.
     """
 
     center: Array
@@ -103,7 +99,7 @@ class RadialLens:
             across, direction = _polar(rays[:, :2])
             return np.arctan2(across, rays[:, 2])[:, None] * direction
         depth = rays[:, 2] + self.xi
-        # Beyond this cone the sphere's far side would be seen a second time.
+        # Beyond this cone the far side of the sphere would appear a second time.
         visible = rays[:, 2] > -(self.xi if self.xi <= 1.0 else 1.0 / self.xi)
         return rays[:, :2] / np.where(visible & (depth > 1e-9), depth, np.nan)[:, None]
 
@@ -119,11 +115,9 @@ class RadialLens:
 
     def _shift(self, plane: Array) -> Array:
         """The tangential part of a distortion (N, 2)."""
-        p1, p2 = self.tangential
-        x, y = plane[:, 0], plane[:, 1]
-        square = x**2 + y**2
-        shift_x = 2 * p1 * x * y + p2 * (square + 2 * x**2)
-        shift_y = p1 * (square + 2 * y**2) + 2 * p2 * x * y
+        (p1, p2), (x, y) = self.tangential, plane.T
+        shift_x = 2 * p1 * x * y + p2 * (3 * x**2 + y**2)
+        shift_y = p1 * (x**2 + 3 * y**2) + 2 * p2 * x * y
         return np.column_stack([shift_x, shift_y])
 
     def _bent(self, plane: Array) -> Array:
@@ -133,7 +127,7 @@ class RadialLens:
         return self.bend.value(radius)[:, None] * direction + self._shift(plane)
 
     def _straight(self, plane: Array) -> Array:
-        """Invert `_bent`: the tangential part is small, so its fixed point contracts."""
+        """Invert `_bent` by a fixed point, which contracts as the tangential part is small."""
         if self.bend is None:
             return plane
         result = np.zeros_like(plane)
@@ -147,30 +141,19 @@ class RadialLens:
 
 @dataclass(frozen=True)
 class CylinderLens:
-    """An image linear in azimuth and elevation: equirectangular, or a panorama.
-
-    The center column looks along the axis, columns grow to the right. Elevations in radians of
-    the lower and upper edge; size as columns, rows.
+    """An image linear in azimuth and elevation, its axis in the center column; `size` is rows and
+    columns.
     """
 
+    sphere: Sphere
     size: tuple[int, int]
-    elevation: tuple[float, float]
     center: None = None
 
     def project(self, rays: Array) -> Array:
-        azimuth = np.arctan2(rays[:, 0], rays[:, 2])
-        elevation = np.arctan2(-rays[:, 1], np.hypot(rays[:, 0], rays[:, 2]))
-        (width, height), (low, high) = self.size, self.elevation
-        column = (azimuth / (2 * np.pi) + 0.5) * width - 0.5
-        row = (high - elevation) / (high - low) * height - 0.5
-        return np.column_stack([column, row])
+        return self.sphere.pixels(rays @ _AXES['forward'].T, *self.size)
 
     def unproject(self, pixels: Array) -> Array:
-        (width, height), (low, high) = self.size, self.elevation
-        azimuth = ((pixels[:, 0] + 0.5) / width - 0.5) * 2 * np.pi
-        elevation = high - (pixels[:, 1] + 0.5) / height * (high - low)
-        flat = np.cos(elevation)
-        return np.column_stack([flat * np.sin(azimuth), -np.sin(elevation), flat * np.cos(azimuth)])
+        return np.asarray(self.sphere.directions(pixels, *self.size) @ _AXES['forward'])
 
 
 @dataclass(frozen=True)
@@ -200,12 +183,11 @@ Lens = RadialLens | CylinderLens | DualFisheyeLens
 
 @dataclass(frozen=True)
 class CameraModel:
-    """A lens on the robot, for images of one size.
+    """A lens on the robot, for images of `size` (rows, columns).
 
-    `size` is rows and columns. `rotation` (3, 3) takes rays of the lens to the robot's axes (x
-    forward, y left, z up; a mirrored image has determinant -1), `scale` (2,) pixels of the
-    calibrated image to those of this size; nothing is visible outside `radii`, given in pixels of
-    the calibrated image, nor outside the image.
+    `rotation` (3, 3) takes rays of the lens to the robot's axes, x forward, y left, z up; its
+    determinant is -1 for a mirrored image. `scale` (2,) takes pixels of the calibrated image to
+    those of the image. Only pixels between `radii`, px of the calibrated image, are visible.
     """
 
     lens: Lens
@@ -215,10 +197,9 @@ class CameraModel:
     radii: tuple[float, float]
 
     def project(self, rays: Array) -> Array:
-        """Columns and rows (N, 2) of rays (N, 3) in the robot's axes; NaN where not visible."""
+        """Columns and rows (N, 2) of rays (N, 3) in the robot's axes; NaN where invisible."""
         pixels = self._limited(self.lens.project(_normalized(np.asarray(rays)) @ self.rotation))
-        pixels = (pixels + 0.5) * self.scale - 0.5
-        return self._inside(pixels)
+        return self._inside((pixels + 0.5) * self.scale - 0.5)
 
     def unproject(self, pixels: Array) -> Array:
         """Unit rays (N, 3) in the robot's axes of pixels (N, 2); NaN where they see nothing."""
@@ -240,13 +221,13 @@ class CameraModel:
         return np.where(visible[:, None], pixels, np.nan)
 
 
-_AXES = {  # columns: where the image's right, its bottom and its center look
+_AXES = {  # columns: directions of the image's right, bottom and center
     'down': np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
     'up': np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
     'forward': np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
 }
 _USUAL_AXIS = {'mirror': 'down', 'polar': 'down', 'fisheye': 'up', 'ocam': 'up'}
-_ASPECT_TOLERANCE = 0.02  # relative, of an image against the calibration; covers rounded sizes
+_ASPECT_TOLERANCE = 0.02  # between image and calibration, for rounded sizes
 
 
 def make_camera(
@@ -263,20 +244,13 @@ def make_camera(
     if min(size) < 1:
         raise CameraError(f'an image of {size[1]} x {size[0]} pixels is empty')
     lens = _make_lens(calibration, size, panorama or PanoramaConfig())
-    radii = (calibration.radius_min, calibration.radius_max)
-    return CameraModel(
-        lens, _rotation(calibration, mount_rpy), size, _scale(calibration, size), radii
-    )
-
-
-def _rotation(calibration: LensCalibration, mount_rpy: Sequence[float]) -> Array:
-    """Rays of the lens to the robot's axes: the axis, then roll, pitch and yaw (REP-103)."""
-    mount = rotation(*np.radians(mount_rpy))
     axis = calibration.axis
     if axis == 'auto' or calibration.camera_model in UNCALIBRATED:
         axis = _USUAL_AXIS.get(calibration.camera_model, 'forward')
     reversal = np.diag([-1.0 if calibration.is_mirrored else 1.0, 1.0, 1.0])
-    return np.asarray(mount @ _AXES[axis] @ reversal)
+    to_robot = rotation(*np.radians(mount_rpy)) @ _AXES[axis] @ reversal
+    radii = (calibration.radius_min, calibration.radius_max)
+    return CameraModel(lens, to_robot, size, _scale(calibration, size), radii)
 
 
 def _scale(calibration: LensCalibration, size: tuple[int, int]) -> Array:
@@ -300,12 +274,11 @@ def _scale(calibration: LensCalibration, size: tuple[int, int]) -> Array:
 def _make_lens(
     calibration: LensCalibration, size: tuple[int, int], panorama: PanoramaConfig
 ) -> Lens:
-    model, (rows, columns) = calibration.camera_model, size
+    model = calibration.camera_model
     if model == 'panorama':
-        low, high = np.radians([panorama.elevation_min, panorama.elevation_max])
-        return CylinderLens((columns, rows), (float(low), float(high)))
+        return CylinderLens(replace(panorama.sphere, clockwise=True), size)
     if model == 'equirectangular':
-        return CylinderLens((columns, rows), (-np.pi / 2, np.pi / 2))
+        return CylinderLens(Sphere(-np.pi / 2, np.pi / 2), size)
     center = np.array([calibration.cx, calibration.cy])
     if model == 'polar':
         return RadialLens(center, np.ones(2), bend=_polar_bend(calibration))
@@ -316,28 +289,36 @@ def _make_lens(
         raise CameraError(
             f'distortion has {len(calibration.distortion)} coefficients; give 4, or none'
         )
-    k1, k2, k3, k4 = calibration.distortion or _LINEAR
+    k1, k2, k3, k4 = calibration.distortion or (0.0,) * 4
     if model == 'mirror':
         curve = Polynomial([0.0, 1.0, 0.0, k1, 0.0, k2])
         bend = increasing(curve, curve.deriv(), _WIDEST_PLANE) if any((k1, k2, k3, k4)) else None
         return RadialLens(center, focal, calibration.xi, bend, (k3, k4))
     curve = Polynomial([0.0, 1.0, 0.0, k1, 0.0, k2, 0.0, k3, 0.0, k4])
     fisheye = RadialLens(center, focal, bend=increasing(curve, curve.deriv(), np.pi))
-    return fisheye if model == 'fisheye' else _dual_fisheye_lens(calibration, fisheye)
+    if model == 'fisheye':
+        return fisheye
+    second = np.array([calibration.second_cx, calibration.second_cy])
+    roll = rotation(0.0, 0.0, np.radians(calibration.second_roll))
+    turn = roll @ np.diag([-1.0, 1.0, -1.0])
+    return DualFisheyeLens(fisheye, replace(fisheye, center=second), turn)
 
 
 def _polar_bend(calibration: LensCalibration) -> Curve:
-    """No calibration but two circles: the angle from the axis grows linearly with the radius."""
+    """The angle from the axis as a linear function of the radius, for uncalibrated cameras."""
     near, far = calibration.radius_min, calibration.radius_max
     if near >= far or calibration.angle_min >= calibration.angle_max:
         raise CameraError('the polar model needs radius_min < radius_max and angle_min < angle_max')
     low, high = np.radians([calibration.angle_min, calibration.angle_max])
     slope = (far - near) / (high - low)
-    line, back = (
-        Polynomial([near - low * slope, slope]),
-        Polynomial([low - near / slope, 1 / slope]),
+
+    def positive(values: Array) -> Array:
+        return np.where(values >= 0.0, values, np.nan)
+
+    return Curve(
+        lambda angle: positive(near + (angle - low) * slope),
+        lambda radius: positive(low + (radius - near) / slope),
     )
-    return Curve(*(lambda x, f=f: np.where(f(x) >= 0.0, f(x), np.nan) for f in (line, back)))
 
 
 def _ocam_lens(calibration: LensCalibration, center: Array, size: tuple[int, int]) -> RadialLens:
@@ -353,25 +334,18 @@ def _ocam_lens(calibration: LensCalibration, center: Array, size: tuple[int, int
     c, d, e = calibration.affine
     if abs(c - d * e) < _LEAST_AFFINE:
         raise CameraError('affine (c d e) of the ocam model is singular: c - d e must not be 0')
-    height = -Polynomial(calibration.polynomial)
-    slope = height.deriv()
+    depth = -Polynomial(calibration.polynomial)
+    slope = depth.deriv()
 
     def angle(radius: Array) -> Array:
-        return np.asarray(np.arctan2(radius, height(radius)))
+        return np.asarray(np.arctan2(radius, depth(radius)))
 
     def derivative(radius: Array) -> Array:
-        depth = height(radius)
-        return np.asarray((depth - radius * slope(radius)) / (radius**2 + depth**2))
+        z = depth(radius)
+        return np.asarray((z - radius * slope(radius)) / (radius**2 + z**2))
 
     calibrated = (calibration.image_height, calibration.image_width)
     limit = calibration.radius_max or float(np.hypot(*np.maximum(size, calibrated)))
-    seen = increasing(angle, derivative, limit)
-    bend = Curve(seen.inverse, seen.value)
+    angles = increasing(angle, derivative, limit)
+    bend = Curve(angles.inverse, angles.value)
     return RadialLens(center, np.ones(2), bend=bend, affine=((1.0, e), (d, c)))
-
-
-def _dual_fisheye_lens(calibration: LensCalibration, first: RadialLens) -> DualFisheyeLens:
-    center = np.array([calibration.second_cx, calibration.second_cy])
-    roll = rotation(0.0, 0.0, np.radians(calibration.second_roll))
-    to_second = roll @ np.diag([-1.0, 1.0, -1.0])
-    return DualFisheyeLens(first, replace(first, center=center), to_second)

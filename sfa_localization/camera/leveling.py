@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Panoramas of a robot that rolls and pitches, and what they would be on level ground.
+"""Panoramas of a tilted robot, and the same panoramas leveled.
 
-Where an IMU says how the robot lies, panoramas are leveled by it, live and from bags; else by what
-they show (`keyframes/tilt.py`).
+Panoramas are leveled by the orientation of an IMU, live and from bags, or else by their content
+(`keyframes/tilt.py`).
 """
 
 from __future__ import annotations
@@ -19,42 +19,36 @@ from sfa_localization.data.run import Image, Panoramas, Stamps
 from sfa_localization.data.sphere import Sphere, rotation
 
 TILTED_RAD = np.radians(0.7)
-"""Images that are tilted by less are as well as level: what a tilt changes is linear."""
+"""A smaller tilt is not corrected."""
 NEAR_NS = 50_000_000
-"""An orientation this near to an image is that of the image: a robot that sways by 4 degrees with
-a correlation time of 0.7 s sways by one degree meanwhile."""
+"""Largest distance in time of an orientation from its image; a robot that sways by 4 degrees with a
+correlation time of 0.7 s tilts by one degree meanwhile."""
 
 
 def tilted(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
-    """What a robot with roll and pitch (2,) rad sees of a panorama (H, W, C) on flat ground; above
-    and below it its edges are repeated.
+    """A level panorama (H, W, C) as taken by a robot with roll and pitch (2,) rad; its upper and
+    lower rows are repeated beyond its edges.
     """
-    return _turned(panorama, rotation(*tilt), sphere)
+    return _rotated(panorama, rotation(*tilt), sphere)
 
 
 def leveled(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
-    """What a robot that sees a panorama (H, W, C) with roll and pitch (2,) rad would see level."""
-    return _turned(panorama, rotation(*tilt).T, sphere)
+    """The level panorama, from one (H, W, C) taken with roll and pitch (2,) rad."""
+    return _rotated(panorama, rotation(*tilt).T, sphere)
 
 
-def _turned(panorama: Image, turn: Array, sphere: Sphere) -> Image:
-    rows, columns = panorama.shape[:2]
-    rays = sphere.rays(rows, columns).reshape(-1, 3).astype(np.float32)
-    x, y, z = (turn.astype(np.float32) @ rays.T).reshape(3, rows, columns)
-    azimuth = np.arctan2(y, x) * (-1 if sphere.clockwise else 1)
-    column = azimuth * (columns / (2 * np.pi)) + (columns / 2 + 0.5)
-    elevation = np.arcsin(np.clip(z, -1, 1))
-    row = (sphere.high - elevation) * (rows / (sphere.high - sphere.low)) - 0.5
+def _rotated(panorama: Image, turn: Array, sphere: Sphere) -> Image:
+    size = panorama.shape[:2]
+    pixels = sphere.pixels(sphere.rays(*size) @ turn.T, *size).astype(np.float32)
     wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
-    across, down = np.asarray(column, np.float32), np.asarray(row, np.float32)
-    kind, edge = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
-    turned = cv2.remap(wrapped, across, down, kind, borderMode=edge)
+    maps = pixels[..., 0] + 1, pixels[..., 1]
+    turned = cv2.remap(wrapped, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(turned, panorama.dtype).reshape(panorama.shape)
 
 
 @dataclass(frozen=True, slots=True)
 class LeveledPanoramas:
-    """Panoramas without the `tilts` (N, 2), roll and pitch rad, that they were taken with."""
+    """Panoramas leveled by their `tilts` (N, 2), roll and pitch rad."""
 
     panoramas: Panoramas
     tilts: Array
@@ -87,14 +81,14 @@ class LeveledPanoramas:
         return images
 
 
-def tilts_at(stamps_ns: Stamps, known_ns: Stamps, tilts: Array) -> Array:
-    """Roll and pitch (M, 2) at stamps (M,), of those (N, 2) at increasing stamps (N,): between
-    both neighbors, NaN where none is near.
+def tilts_at(stamps_ns: Stamps, measured_ns: Stamps, tilts: Array) -> Array:
+    """Roll and pitch (M, 2) at stamps (M,), interpolated between measured ones (N, 2) at increasing
+    stamps (N,); NaN where none is within NEAR_NS.
     """
-    if not len(known_ns):
+    if not len(measured_ns):
         return np.full((len(stamps_ns), 2), np.nan)
-    after = np.searchsorted(known_ns, stamps_ns).clip(0, len(known_ns) - 1)
+    after = np.searchsorted(measured_ns, stamps_ns).clip(0, len(measured_ns) - 1)
     before = np.maximum(after - 1, 0)
-    apart = np.minimum(*(np.abs(known_ns[side] - stamps_ns) for side in (before, after)))
-    between = [np.interp(stamps_ns, known_ns, tilt) for tilt in tilts.T]
-    return np.where((apart <= NEAR_NS)[:, None], np.column_stack(between), np.nan)
+    since, until = np.abs(measured_ns[before] - stamps_ns), np.abs(measured_ns[after] - stamps_ns)
+    between = np.column_stack([np.interp(stamps_ns, measured_ns, tilt) for tilt in tilts.T])
+    return np.where((np.minimum(since, until) <= NEAR_NS)[:, None], between, np.nan)

@@ -1,12 +1,11 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""From the image of an omnidirectional camera to a panorama, by fixed-point lookup tables."""
+"""Panoramas from images of an omnidirectional camera, by lookup tables."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
@@ -51,12 +50,11 @@ class _Tables:
 class Unwrapper:
     """Turns images of one camera into panoramas; tables are built when their size changes.
 
-    Panorama pixels that the camera does not see (outside the image or its radii, masked, in a
-    blind sector) repeat the nearest visible pixel of their row, or row of the panorama where the
-    whole row is hidden. The repetition is part of the tables, costs nothing, follows the light of
-    the scene and, unlike a constant color, draws no edge that turns with the robot.
+    Invisible panorama pixels (outside the image or its radii, masked, in a blind sector) repeat the
+    nearest visible pixel of their row, or of the nearest row with any: unlike a constant color,
+    this makes no edges that turn with the robot.
 
-    `calibration` is the lens where it is not to be read from the camera's calibration_file.
+    `calibration` is the lens; by default the one that the camera describes.
     """
 
     def __init__(
@@ -85,10 +83,13 @@ class Unwrapper:
     def __call__(self, image: Image) -> Image:
         """Unwrap a BGR image (H, W, 3) uint8 to (panorama.height, panorama.width, 3) uint8.
 
-        An image shaped like a panorama is only resized. Raises CameraError for an array that is no
-        such image, or not one of this camera.
+        An image shaped like a panorama is only resized. Raises CameraError for any other array, and
+        for an image of another camera.
         """
-        _check(image)
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+            raise CameraError('an image must be an array of uint8')
+        if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+            raise CameraError(f'an image must have shape (H, W, 3), not {image.shape}')
         size = (image.shape[0], image.shape[1])
         if self.is_panorama(size):
             return self._aligned(image)
@@ -101,13 +102,13 @@ class Unwrapper:
         return self._tables_of(size).visible
 
     def is_panorama(self, size: tuple[int, int]) -> bool:
-        """Whether images of `size` (rows, columns) are panoramas already, so only resized."""
+        """Whether images of `size` (rows, columns) are panoramas, which are only resized."""
         if self.model == 'panorama':
             return not any(self.camera.mount_rpy[:2])
         return self.model != 'equirectangular' and looks_like_panorama(*size)
 
     def _aligned(self, image: Image) -> Image:
-        """A panorama, resized; if the camera makes them, also turned to the convention."""
+        """A panorama, resized; that of a panorama camera is also turned to forward."""
         height, width = self.panorama.height, self.panorama.width
         shrinks = image.shape[0] > height or image.shape[1] > width
         method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
@@ -129,13 +130,6 @@ class Unwrapper:
         return self._tables[size]
 
 
-def _check(image: Any) -> None:
-    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
-        raise CameraError('an image must be an array of uint8')
-    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise CameraError(f'an image must have shape (H, W, 3), not {image.shape}')
-
-
 def build_tables(
     camera: CameraConfig,
     calibration: LensCalibration,
@@ -148,7 +142,9 @@ def build_tables(
     pixels = model.project(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
     visible = np.isfinite(pixels[..., 0]) & ~_in_sectors(rays, camera.blind_sectors)
     if camera.mask_file:
-        visible &= _unmasked(pixels, read_mask(camera.mask_file, size))
+        mask = read_mask(camera.mask_file, size)
+        nearest = np.rint(np.nan_to_num(pixels)).astype(int).clip(0, [size[1] - 1, size[0] - 1])
+        visible &= mask[nearest[..., 1], nearest[..., 0]]
     columns, rows = np.moveaxis(pixels[nearest_visible(visible)], -1, 0)
     wraps = calibration.camera_model in UNCALIBRATED  # its columns close on themselves
     if not wraps:
@@ -160,9 +156,9 @@ def build_tables(
 
 
 def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
-    """Mask (H, W) of the rays whose azimuth lies in one of the sectors (start, end in degrees).
+    """Mask (H, W) of the rays whose azimuth is in a sector from start to end, degrees.
 
-    A sector that comes around to where it starts, as from -180 to 180, is the whole circle.
+    A sector whose end meets its start, as from -180 to 180, is the whole circle.
     """
     if len(sectors) % 2:
         raise CameraError('blind_sectors must hold a start and an end for each sector')
@@ -187,18 +183,9 @@ def read_mask(path: str, size: tuple[int, int]) -> Mask:
     return np.asarray(resized) >= 128
 
 
-def _unmasked(pixels: Array, mask: Mask) -> Mask:
-    """Mask (H, W) of the lookups (H, W, 2) whose nearest pixel is True in the mask."""
-    nearest = np.rint(np.nan_to_num(pixels)).astype(int)
-    columns, rows = np.moveaxis(np.clip(nearest, 0, np.array(mask.shape[::-1]) - 1), -1, 0)
-    return np.asarray(mask[rows, columns])
-
-
 def nearest_visible(visible: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For each pixel of `visible` (H, W), row and column (H, W) of the visible one to repeat.
-
-    The nearest in the same row, around the back; in a row without any, that of the nearest row
-    with some. Raises CameraError when nothing is visible.
+    """Rows and columns (H, W) of the visible pixel that each pixel of `visible` (H, W) repeats: the
+    nearest in its row, or in the nearest row with any. Raises CameraError when nothing is visible.
     """
     usable_rows = np.flatnonzero(visible.any(axis=1))
     if usable_rows.size == 0:
@@ -211,11 +198,12 @@ def nearest_visible(visible: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return np.broadcast_to(rows[:, None], visible.shape), columns
 
 
-def _nearest_column(visible: NDArray[np.bool_]) -> NDArray[np.intp]:
+def _nearest_column(visible: Mask) -> NDArray[np.intp]:
+    """The nearest visible column (W,) of each column of a row (W,), around the back."""
     width = len(visible)
     columns = np.flatnonzero(visible)
     around = np.concatenate([columns - width, columns, columns + width])
-    right = np.searchsorted(around, np.arange(width))
-    left = np.maximum(right - 1, 0)
-    nearer = np.arange(width) - around[left] < around[right] - np.arange(width)
-    return np.asarray(np.where(nearer, around[left], around[right]) % width)
+    after = np.searchsorted(around, np.arange(width))
+    before = np.maximum(after - 1, 0)
+    nearer = np.arange(width) - around[before] < around[after] - np.arange(width)
+    return np.asarray(np.where(nearer, around[before], around[after]) % width)

@@ -14,17 +14,17 @@ from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.data.run import Image
 
 DARK_LEVEL = 8.0
-"""Gray levels: an image of lower mean is dark, too dark to distinguish places."""
+"""Gray levels: an image with a lower mean is too dark to distinguish places."""
 FLAT_LEVEL = 3.0
-"""Gray levels: an image of lower standard deviation is covered, it shows sensor noise at most."""
+"""Gray levels: an image with a lower standard deviation is covered, and shows only noise."""
 FROZEN_IMAGES = 5
-"""Equal images in a row that mean a frozen camera; fewer also come from a late driver."""
+"""Equal images in a row of a frozen camera; a late driver may send fewer."""
 FROZEN_S = 5.0
-"""Seconds of equal images before a camera is reopened, because that interrupts it."""
+"""Seconds of equal images after which a camera is reopened."""
 EXPLAINED_WARNING = 0.4
-"""A part of an image that is worth a warning where its place explains no more, although the image
-is still used: of images of which a half is covered it is 0.15 to 0.5."""
-_STRIDE = 3  # every third pixel along each axis is enough, and nine times faster
+"""An image of which its place explains less is used with a warning; of half-covered images it is
+0.15 to 0.5."""
+_STRIDE = 3  # every third pixel along each axis is compared
 
 
 class FrozenWatch:
@@ -68,7 +68,6 @@ class ImageWatch:
             return 'image is covered: it shows nothing'
         if self._frozen.repeats + 1 >= FROZEN_IMAGES:
             return 'camera is frozen: it repeats its image'
-        # It shows where the robot was, not where it is.
         return 'image repeats the one before' if self.repeats else ''
 
     @property
@@ -78,5 +77,5 @@ class ImageWatch:
 
     def judge_place(self, explained: float) -> str:
         """Why an image cannot be used of which its place explains this part; '' when it can."""
-        known = explained >= self.config.least_explained
-        return '' if known else 'image is unlike any of training'
+        familiar = explained >= self.config.least_explained
+        return '' if familiar else 'image is unlike any of training'

@@ -18,8 +18,8 @@ from sfa_localization.camera.settings import (
     PanoramaConfig,
 )
 from sfa_localization.commands import options
-from sfa_localization.data.errors import LocalizationError
-from sfa_localization.data.files import require_outputs
+from sfa_localization.data.errors import CameraError, LocalizationError
+from sfa_localization.data.files import atomic_write, require_outputs
 from sfa_localization.data.run import Image
 
 WRITES = 'with --output a calibration file, with --check an image; else nothing'
@@ -71,12 +71,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate; print the calibration."""
     from sfa_localization.camera import calibration, calibration_files
+    from sfa_localization.camera.encodings import encode_png
     from sfa_localization.camera.panorama import Unwrapper
 
     outputs = [path for path in (arguments.output, arguments.check) if path]
     require_outputs(outputs, [*arguments.images, arguments.calibration])
     if arguments.output:
-        calibration.require_own(arguments.output)
+        calibration.require_replaceable(arguments.output)
     if arguments.check:
         options.require_kind(arguments.check, '.png')
     images = _images(arguments)
@@ -90,11 +91,13 @@ def run(arguments: argparse.Namespace) -> int:
         # Without --check too: what is written can be used.
         check = calibration.check_image(images[0], Unwrapper(camera, PanoramaConfig(), lens))
         if arguments.check:
-            calibration.write_check(arguments.check, check)
+            with atomic_write(arguments.check, CameraError) as file:
+                file.write(encode_png(check))
     elif arguments.check:
         raise LocalizationError('--check needs an image of the camera to draw in')
     if arguments.output:
-        calibration.write_calibration(arguments.output, text)
+        with atomic_write(arguments.output, CameraError) as file:
+            file.write(text.encode())
     print(text, end='')
     where = arguments.check or 'the image that --check CHECK.png writes'
     print(f'look at {where}: does the horizon lie on its line?', file=sys.stderr)

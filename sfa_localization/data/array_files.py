@@ -6,19 +6,19 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import ModelError
-from sfa_localization.data.files import absence, atomic_write, is_regular
+from sfa_localization.data.files import absence, atomic_write
 from sfa_localization.data.rejections import short_line
 
 Arrays = dict[str, NDArray[Any]]
-Number = TypeVar('Number', bound=np.generic)
 _HEADER, _CHECKSUM = 'header', 'sha256'
 
 
@@ -27,44 +27,42 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
     The array `header` is a JSON object as text; the checksum of all arrays is added to it.
     """
-    plain: dict[str, Any] = dict(arrays)
-    if _HEADER in plain:
-        header = json.loads(str(plain[_HEADER]))
-        header[_CHECKSUM] = checksum(plain, header)
-        plain[_HEADER] = np.array(json.dumps(header, sort_keys=True))
+    header = json.loads(str(arrays[_HEADER]))
+    header[_CHECKSUM] = _checksum(arrays, header)
+    text = np.array(json.dumps(header, sort_keys=True))
     with atomic_write(Path(path), ModelError) as file:
-        np.savez(file, **plain)
+        np.savez(file, **{**arrays, _HEADER: text})  # type: ignore[arg-type]
 
 
 def read_arrays(path: Path, kind: str, version: int, remedy: str) -> Arrays:
     """Arrays of an .npz file whose header names its kind and version. Raises ModelError."""
-    if not is_regular(path):
+    if not os.path.isfile(path):
         raise ModelError(f'{path}: {absence(path)}: {remedy}')
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
         header = json.loads(str(arrays[_HEADER]))
-        found_kind, found_version = header['format'], header['version']
-        intact = header.get(_CHECKSUM) == checksum(arrays, header)
+        stored = {name: short_line(str(header[name])) for name in ('format', 'version')}
+        intact = header.get(_CHECKSUM) == _checksum(arrays, header)
     except Exception:  # zip, numpy and json fail in many ways on foreign bytes
         damaged = f'{path}: not a {kind}, or a damaged one: copy it again'
         raise ModelError(f'{damaged}, or {remedy}') from None
-    if found_kind != kind:
-        raise ModelError(f'{path}: a {short_line(str(found_kind))}, not a {kind}: {remedy}')
-    if found_version != version:
-        found = short_line(str(found_version))
-        raise ModelError(f'{path}: version {found}, this software reads {version}: {remedy} again')
+    if stored['format'] != kind:
+        raise ModelError(f'{path}: a {stored["format"]}, not a {kind}: {remedy}')
+    if header['version'] != version:
+        reads = f'version {stored["version"]}, this software reads {version}'
+        raise ModelError(f'{path}: {reads}: {remedy} again')
     if not intact:
         raise ModelError(f'{path}: damaged (its checksum is wrong or missing): {remedy} again')
     return arrays
 
 
-def packed(lower: NDArray[Number]) -> NDArray[Number]:
+def packed(lower: NDArray[Any]) -> NDArray[Any]:
     """The lower triangle (N (N + 1) / 2,) of a triangular matrix (N, N), row by row."""
     return np.asarray(lower[np.tril_indices(len(lower))])
 
 
-def unpacked(triangle: NDArray[Number]) -> NDArray[Number]:
+def unpacked(triangle: NDArray[Any]) -> NDArray[Any]:
     """The lower triangular matrix (N, N), in Fortran order, of its packed triangle."""
     size = (round((8 * len(triangle) + 1) ** 0.5) - 1) // 2
     lower = np.zeros((size, size), triangle.dtype, order='F')
@@ -72,8 +70,8 @@ def unpacked(triangle: NDArray[Number]) -> NDArray[Number]:
     return lower
 
 
-def checksum(arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any]) -> str:
-    """SHA-256 of arrays (N, ...), by name, and of the header without its own checksum."""
+def _checksum(arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any]) -> str:
+    """SHA-256 of arrays (N, ...), by name, and of the header without its checksum."""
     rest = {name: value for name, value in header.items() if name != _CHECKSUM}
     digest = hashlib.sha256(json.dumps(rest, sort_keys=True).encode())
     for name in sorted(set(arrays) - {_HEADER}):

@@ -4,7 +4,7 @@
 
 
 class LocalizationError(Exception):
-    """Base of every expected error; its text names the culprit and the remedy."""
+    """Base of every expected error; its text names the cause and the remedy."""
 
 
 class ConfigError(LocalizationError):

@@ -15,14 +15,7 @@ from typing import IO, Any
 
 from sfa_localization.data.errors import LocalizationError
 
-NEW_FILE_MODE = 0o644
-"""Permissions of a file that was not there before."""
-_BEGINNING = 1000  # bytes, which show what wrote a file
-
-
-def is_regular(path: Path | str) -> bool:
-    """Whether there is a regular file; False for any path that the system cannot have."""
-    return os.path.isfile(path)
+_NEW_FILE_MODE = 0o644
 
 
 def absence(path: Path | str) -> str:
@@ -39,27 +32,25 @@ def read_regular(path: Path | str, largest: int) -> bytes:
     """
     if '\0' in str(path):
         raise OSError('a path with a zero byte')
-    if os.path.exists(path) and not is_regular(path):
+    if os.path.exists(path) and not os.path.isfile(path):
         raise OSError('it is no regular file')
-    data = start_of(path, largest + 1)
+    with open(path, 'rb') as file:
+        data = file.read(largest + 1)
     if len(data) > largest:
         raise OSError(f'larger than {largest} bytes')
     return data
 
 
-def first_bytes(path: Path, most: int = _BEGINNING) -> bytes:
-    """The beginning of a regular file; nothing where there is none. Raises OSError."""
-    return start_of(path, most) if is_regular(path) else b''
-
-
-def start_of(path: Path | str, most: int) -> bytes:
-    """The beginning of a file that is there. Raises OSError."""
+def first_bytes(path: Path, most: int = 1000) -> bytes:
+    """The first bytes of a regular file, b'' where there is none. Raises OSError."""
+    if not os.path.isfile(path):
+        return b''
     with open(path, 'rb') as file:
         return file.read(most)
 
 
 def resolved(path: Path) -> Path:
-    """Where a path leads through links; also of a loop of them. Raises LocalizationError."""
+    """The file that a path leads to through links, even in a loop. Raises LocalizationError."""
     try:
         return Path(os.path.realpath(path))
     except FileNotFoundError:
@@ -74,9 +65,8 @@ def atomic_write(
 ) -> Iterator[IO[bytes]]:
     """Write to a temporary file that becomes `path` at the end, or is removed after any error.
 
-    Missing folders are made. Of a symbolic link the file that it leads to is replaced; a file
-    keeps its permissions. Raises `error`, naming the path, also where it is a folder, a device or
-    a pipe.
+    Missing folders are made. A symbolic link stays, and its target is replaced; a file keeps its
+    permissions. Raises `error` naming the path, also for a folder, a device or a pipe.
     """
     temporary = None
     try:
@@ -96,38 +86,36 @@ def atomic_write(
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON, at once or not at all. Raises LocalizationError."""
+    """Write JSON, completely or not at all. Raises LocalizationError."""
     with atomic_write(path) as file:
         file.write(f'{json.dumps(content, indent=2)}\n'.encode())
 
 
 def replaced_mode(path: Path) -> int:
-    """The permissions of what `path` replaces. Raises OSError where that is no regular file."""
+    """The permissions of the file that `path` replaces. Raises OSError for anything but a file."""
     try:
-        there = path.stat()
+        status = path.stat()
     except FileNotFoundError:
-        return NEW_FILE_MODE
-    if not stat.S_ISREG(there.st_mode):
+        return _NEW_FILE_MODE
+    if not stat.S_ISREG(status.st_mode):
         raise OSError(f'it {absence(path)}')
-    return stat.S_IMODE(there.st_mode)
+    return stat.S_IMODE(status.st_mode)
 
 
 def require_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
-    """Raise LocalizationError before the work where atomic_write could not put its results, or
-    they would replace each other or what is read.
+    """Raise LocalizationError before the work where atomic_write could not write its results, or
+    where they would replace each other or an input.
     """
     targets: set[Path] = set()
     for path in outputs:
-        target = resolved(path)
-        if target in targets:
+        if resolved(path) in targets:
             raise LocalizationError(f'{path}: named for two outputs: give each its own')
-        targets.add(target)
+        targets.add(resolved(path))
         try:
             replaced_mode(path)
         except OSError as reason:
-            raise LocalizationError(
-                f'{path}: cannot be written: {reason.strerror or reason}'
-            ) from None
+            why = reason.strerror or reason
+            raise LocalizationError(f'{path}: cannot be written: {why}') from None
     for path in filter(None, inputs):
         if resolved(path) in targets:
             raise LocalizationError(

@@ -20,7 +20,7 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 SPOT_RADIUS_M = 0.1
-"""A robot that turns more tightly than this turns on the spot: it has no way to lose there."""
+"""A robot whose turning radius is smaller turns on the spot: slip there loses no distance."""
 
 
 def wrap_angle(angle_rad: Array | float) -> Array:
@@ -43,18 +43,17 @@ def compose(a: Array, b: Array) -> Array:
     return np.stack([x, y, wrap_angle(a[..., 2] + b[..., 2])], axis=-1)
 
 
-def invert(a: Array) -> Array:
-    """Inverse of poses (..., 3): compose(invert(a), a) is the identity."""
-    a = np.asarray(a, float)
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    x = -c * a[..., 0] - s * a[..., 1]
-    y = s * a[..., 0] - c * a[..., 1]
-    return np.stack([x, y, wrap_angle(-a[..., 2])], axis=-1)
-
-
 def relative(a: Array, b: Array) -> Array:
     """Pose of `b` seen from `a`; (..., 3) each."""
-    return compose(invert(a), b)
+    a, step = np.asarray(a, float), np.asarray(b, float) - a
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x, y = c * step[..., 0] + s * step[..., 1], c * step[..., 1] - s * step[..., 0]
+    return np.stack([x, y, wrap_angle(step[..., 2])], axis=-1)
+
+
+def invert(a: Array) -> Array:
+    """Inverse of poses (..., 3): compose(invert(a), a) is the identity."""
+    return relative(a, np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,21 +81,16 @@ def align(source: Array, target: Array) -> RigidTransform:
     source, target = np.asarray(source, float), np.asarray(target, float)
     if source.shape != target.shape or source.ndim != 2 or len(source) < 2:
         raise DataError(f'cannot align points of shapes {source.shape} and {target.shape}')
-    turn, shift = align_complex(_complex(source), _complex(target))
+    turn, shift = align_complex(source @ np.array([1.0, 1j]), target @ np.array([1.0, 1j]))
     return RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
-
-
-def _complex(points: Array) -> Complex:
-    return np.asarray(points[:, 0] + 1j * points[:, 1])
 
 
 def align_complex(
     source: Complex, target: Complex, weights: Array | None = None
 ) -> tuple[complex, complex]:
-    """Least-squares unit rotation and shift, turn * source + shift = target, of points x + iy (N,).
+    """Unit rotation and shift of points x + iy (N,) with turn * source + shift = target.
 
-    `weights` (N,) of the squared distances, all equal by default. Points without extent are
-    not turned.
+    Minimizes squared distances, with `weights` (N,). Points without extent are not turned.
     """
     a, b = np.average(source, weights=weights), np.average(target, weights=weights)
     products = np.conj(source - a) * (target - b)

@@ -9,7 +9,7 @@ from collections import Counter
 LONGEST = 240
 """Characters of a reason: two lines of a terminal."""
 MOST = 32
-"""Different reasons that are counted separately."""
+"""Different reasons that are counted one by one."""
 OTHER = 'other reasons'
 
 
@@ -27,17 +27,16 @@ class RejectionCounter(Counter[str]):
 
 def short_line(text: str) -> str:
     """One printable line of at most LONGEST characters."""
-    # Cut first: the text may be very long.
-    line = ' '.join(text[: 2 * LONGEST].split())
+    line = ' '.join(text[: 2 * LONGEST].split())  # the text may be very long
     line = ''.join(letter if letter.isprintable() else '?' for letter in line)
     return line if len(line) <= LONGEST else line[: LONGEST - 3] + '...'
 
 
 def encodable(text: str) -> str:
-    """The text in UTF-8, which names of files may not be: their other bytes become \\udcff."""
+    """The text in UTF-8; bytes of file names that are not UTF-8 become \\udcff."""
     return text.encode(errors='backslashreplace').decode()
 
 
 def quoted(value: object) -> str:
-    """A value of anyone's as Python writes it, in one line of bounded length."""
+    """The repr of any value, in one line of bounded length."""
     return short_line(repr(value))

@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The robot itself: where its camera sits, how late its images are stamped, how its wheels count.
+"""The robot: place and delay of its camera, scale of its wheels.
 
-Training learns these with the map, once; a model holds them, and the filter begins with them.
-Frames are those of REP 103: base_link between the wheels, x ahead, y to the left.
+Training learns these with the map; a model holds them, and they are the filter's prior. Frames
+are those of REP 103: base_link between the wheels, x ahead, y to the left.
 """
 
 from __future__ import annotations
@@ -20,14 +20,12 @@ from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.messages import LARGEST_SCALE
 
 CAMERA_STD_M = 0.5
-"""Of each coordinate of a camera on a robot of which nothing is known: robots are about as long."""
+"""Prior of each coordinate of a camera on a robot of unknown size."""
 UNKNOWN_YAW_STD = math.pi / math.sqrt(3)
-"""rad, of an angle of which nothing is known."""
-LARGEST_LEVER_M = 5.0
-"""No camera of a ground robot sits farther from the middle of its axle."""
-
+"""Standard deviation, rad, of an angle that is uniform on the circle."""
+_LARGEST_LEVER_M = 5.0  # a camera of a ground robot sits nearer to the middle of its axle
 LONGEST_DELAY_S = 10.0
-"""Of a camera: training finds delays of up to half a second."""
+"""Of a camera; training finds delays of up to half a second."""
 
 
 class Quantity(NamedTuple):
@@ -39,13 +37,12 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """What training learned of a robot, or what is assumed without any training: clocks that start
-    anew each day, the tolerance of a tire's diameter, a third of the half track of a small robot.
+    """What training learned of a robot; the defaults are the prior of an unknown robot.
 
-    The camera sits `camera_ahead` and `camera_left` m of base_link, and looks `camera_yaw` rad to
-    the left of where it did in the first drive; its images are stamped `camera_delay` s late. The
-    robot drives `wheel_scale` times the way that its odometry counts, less `turn_loss` m per
-    radian of its turns. Raises DataError for what no robot has.
+    The camera sits `camera_ahead` and `camera_left` m of base_link, turned left by `camera_yaw` rad
+    since the first drive; its images are stamped `camera_delay` s late. The robot drives
+    `wheel_scale` times the distance of its odometry, minus `turn_loss` m per radian of its turns.
+    Raises DataError for impossible values.
     """
 
     camera_ahead: Quantity = Quantity(0.0, 0.0)
@@ -58,17 +55,17 @@ class Rig:
     def __post_init__(self) -> None:
         for name, (value, std) in self.items():
             if not (math.isfinite(value) and 0.0 <= std < math.inf):
-                raise DataError(f'{name} is {value} +- {std}')
-        if abs(self.lever) > LARGEST_LEVER_M:
-            raise DataError(f'a camera {abs(self.lever):.3g} m beside base_link is on no robot')
+                raise DataError(f'{name} is {value} +- {std}, which is no estimate')
+        if abs(self.lever) > _LARGEST_LEVER_M:
+            raise DataError(f'a camera {abs(self.lever):.3g} m beside base_link is impossible')
         if not 1 / LARGEST_SCALE <= self.wheel_scale.value <= LARGEST_SCALE:
-            raise DataError(f'wheels that drive {self.wheel_scale.value:.3g} times their way')
+            raise DataError(f'a scale of wheels of {self.wheel_scale.value:.3g} is impossible')
         if abs(self.camera_delay.value) > LONGEST_DELAY_S:
-            raise DataError(f'images stamped {self.camera_delay.value:.3g} s late')
+            raise DataError(f'a camera delay of {self.camera_delay.value:.3g} s is impossible')
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Sequence[float]]) -> Rig:
-        """Of pairs of value and standard deviation by name. Raises DataError."""
+        """From pairs of value and standard deviation by name. Raises DataError."""
         try:
             return cls(**{name: Quantity(*map(float, pair)) for name, pair in values.items()})
         except (TypeError, ValueError) as error:
@@ -84,54 +81,48 @@ class Rig:
 
     @property
     def lever(self) -> complex:
-        """Where the camera sits, ahead + i left, m."""
+        """Lever arm of the camera, ahead + i left, m."""
         return complex(self.camera_ahead.value, self.camera_left.value)
 
-    @property
-    def lever_variance(self) -> float:
-        """Of each coordinate of it, m^2."""
-        return (self.camera_ahead.std**2 + self.camera_left.std**2) / 2
-
     def base(self, pose: Array, covariance: Array, facing: complex) -> tuple[Array, Array]:
-        """Pose (3,) and covariance (3, 3) of base_link by those of the camera.
+        """Pose (3,) and covariance (3, 3) of base_link from those of the camera.
 
-            base = camera - exp(i yaw) l
+            base = camera - exp(i yaw) lever
 
-        of which the mean over an uncertain yaw is taken. An error of l has moved the labels of
-        training as well, by the mean `facing` of exp(i yaw) of those that the image is compared
-        with: at the heading of training it moves nothing. Variances: see a wrapped normal's.
+        as the mean over the wrapped normal distribution of the yaw. An error of the lever arm has
+        also moved the labels of training, by the mean `facing` of exp(i yaw) of the keyframes
+        matched: at the heading of training it cancels.
         """
         lever, turn = self.lever, float(pose[2] - self.camera_yaw.value)
         variance = float(covariance[2, 2]) + self.camera_yaw.std**2
-        seen = np.exp(1j * turn - variance / 2)
-        across = -1j * lever * seen
+        mean_turn = np.exp(1j * turn - variance / 2)
+        across = -1j * lever * mean_turn
         jacobian = np.eye(3)
         jacobian[:2, 2] = across.real, across.imag
-        based = np.asarray(covariance, float).copy()
-        based[2, 2] = variance
-        based = jacobian @ based @ jacobian.T
-        # Of a yaw that is hardly known, the whole lever is uncertain, along it as well as across.
+        base = np.asarray(covariance, float).copy()
+        base[2, 2] = variance
+        base = jacobian @ base @ jacobian.T
+        # Second order: with a large yaw variance the lever arm is uncertain along itself, too.
         along = (abs(lever) * -math.expm1(-variance)) ** 2 / 2
         labels = facing * np.exp(-1j * self.camera_yaw.value)
-        based[:2, :2] += (along + self.lever_variance * abs(labels - seen) ** 2) * np.eye(2)
-        x, y = pose[0] - (lever * seen).real, pose[1] - (lever * seen).imag
-        return np.array([x, y, wrap_angle(turn)]), based
+        lever_variance = (self.camera_ahead.std**2 + self.camera_left.std**2) / 2
+        base[:2, :2] += (along + lever_variance * abs(labels - mean_turn) ** 2) * np.eye(2)
+        x, y = pose[0] - (lever * mean_turn).real, pose[1] - (lever * mean_turn).imag
+        return np.array([x, y, wrap_angle(turn)]), base
 
     def camera(self, poses: Array) -> Array:
-        """Poses (N, 3) of the camera by those (N, 3) of base_link."""
+        """Poses (N, 3) of the camera from those (N, 3) of base_link."""
         moved = self.lever * np.exp(1j * poses[:, 2])
         yaw = wrap_angle(poses[:, 2] + self.camera_yaw.value)
         return np.column_stack([poses[:, 0] + moved.real, poses[:, 1] + moved.imag, yaw])
 
     def as_text(self) -> list[str]:
-        """Lines for a terminal: what is worth a word."""
-        ahead, left = self.camera_ahead, self.camera_left
+        """Lines for a terminal."""
         turned, delay = self.camera_yaw, self.camera_delay
         scale, loss = self.wheel_scale, self.turn_loss
-        lines = [
-            f'camera: {_apart(ahead, "ahead of", "behind")} and '
-            f'{_apart(left, "left of", "right of")} base_link'
-        ]
+        ahead = _offset(self.camera_ahead, 'ahead of', 'behind')
+        aside = _offset(self.camera_left, 'left of', 'right of')
+        lines = [f'camera: {ahead} and {aside} base_link']
         if turned.std >= UNKNOWN_YAW_STD:
             lines.append('camera turned between the drives: headings of images are not used')
         elif turned.value or turned.std:
@@ -144,6 +135,6 @@ class Rig:
         return lines
 
 
-def _apart(quantity: Quantity, positive: str, negative: str) -> str:
+def _offset(quantity: Quantity, positive: str, negative: str) -> str:
     side = positive if quantity.value >= 0 else negative
     return f'{abs(quantity.value):.2f} m (+- {quantity.std:.2f}) {side}'

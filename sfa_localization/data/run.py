@@ -17,7 +17,7 @@ from sfa_localization.data.geometry import Array, Indices, compose, relative, wr
 Stamps = NDArray[np.int64]
 Image = NDArray[np.uint8]
 POINT_STD_M = 0.02
-"""Of a measured place whose error is not stated: of a robot that was put on a mark by eye."""
+"""Standard deviation of a point without one: a robot was put on a mark by eye."""
 BATCH = 16
 """Images that are read and processed together."""
 
@@ -39,16 +39,14 @@ class Trajectory:
         """
         if len(self) == 0:
             return np.zeros(len(stamps_ns), bool)
-        inside = (stamps_ns >= self.stamps_ns[0]) & (stamps_ns <= self.stamps_ns[-1])
-        if tolerance_ns <= 0:
-            return np.asarray(inside)
         before = np.searchsorted(self.stamps_ns, stamps_ns, side='right') - 1
         after = np.searchsorted(self.stamps_ns, stamps_ns, side='left')
+        inside = (before >= 0) & (after < len(self))
         before, after = np.clip([before, after], 0, len(self) - 1)
-        close = (stamps_ns - self.stamps_ns[before] <= tolerance_ns) & (
-            self.stamps_ns[after] - stamps_ns <= tolerance_ns
+        since, until = stamps_ns - self.stamps_ns[before], self.stamps_ns[after] - stamps_ns
+        return np.asarray(
+            inside & ((tolerance_ns <= 0) | (np.maximum(since, until) <= tolerance_ns))
         )
-        return np.asarray(inside & close)
 
     def at(self, stamps_ns: Stamps) -> Array:
         """Poses (M, 3) interpolated along constant twist between neighbors; clamped outside."""
@@ -61,14 +59,17 @@ class Trajectory:
 
 
 def _along(start: Array, end: Array, t: Array) -> Array:
-    """Poses at a fraction t (M,) of the arc from start to end, both (M, 3)."""
+    """Poses at a fraction t (M,) of the arc from start to end, both (M, 3).
+
+    The chord of an arc that turns by a points along a / 2, and is sinc(a / 2 pi) times the arc.
+    """
     step = relative(start, end)
     half = step[:, 2] / 2
-    # The chord of an arc points along half its turn; a part of the arc has a shorter chord.
-    chord = np.hypot(step[:, 0], step[:, 1]) * np.sinc(t * half / np.pi) / np.sinc(half / np.pi)
+    chord = t * np.hypot(*step[:, :2].T) * np.sinc(t * half / np.pi) / np.sinc(half / np.pi)
     bearing = np.arctan2(step[:, 1], step[:, 0]) - half + t * half
-    part = np.stack([t * chord * np.cos(bearing), t * chord * np.sin(bearing), t * step[:, 2]], -1)
-    return compose(start, part)
+    return compose(
+        start, np.stack([chord * np.cos(bearing), chord * np.sin(bearing), 2 * t * half], -1)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,14 +77,9 @@ class Odometry:
     """Wheel odometry: poses in the odom frame and the twist that moved them.
 
     `stamps_ns` (N,), `poses` (N, 3), `twists` (N, 2) as v m/s, omega rad/s; `variances` (N, 2) of
-    v and omega as in the messages, 0 where unknown. The odometry frame may start anywhere.
-
-    Everywhere in this package a twist is the mean over the time since the previous message, as
-    drivers of wheel encoders publish it: the pose has moved by this twist. The first twist is not
-    used.
-
-    `part` (N,) numbers the unbroken parts, by default one: between two of them nothing is known of
-    the motion, and in a part of one message nothing of where it was.
+    v and omega as in the messages, 0 where unknown. A twist is the mean over the time since the
+    previous message, as drivers of wheel encoders publish it; the first is not used. `part` (N,)
+    numbers the unbroken parts, by default a single one: the motion between two parts is unknown.
     """
 
     stamps_ns: Stamps
@@ -118,8 +114,8 @@ class YawRate:
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """Measured places of the robot, in the frame that a map is wanted in: `names` (K,), `stamps_ns`
-    (K,), `places` (K,) x + i y m, `std` (K,) m along each axis.
+    """Measured positions of the robot in the frame of the map: `names` (K,), `stamps_ns` (K,),
+    `places` (K,) x + i y m, `std` (K,) m along each axis.
     """
 
     names: tuple[str, ...]
@@ -144,7 +140,7 @@ class Points:
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """Messages of a stream: the number used, and the numbers skipped by reason."""
+    """Messages of a stream: the number used, and the number skipped for each reason."""
 
     used: int = 0
     skipped: dict[str, int] = field(default_factory=dict)
@@ -154,8 +150,8 @@ class Count:
 
 
 class Panoramas(Protocol):
-    """The images of a run, streamed, never all in memory: stamps (N,), and the rows, columns and
-    channels (BGR, uint8) of each.
+    """The images of a run, read from disk in batches: stamps (N,), and the shape (H, W, C) of each,
+    BGR uint8.
     """
 
     @property
@@ -175,9 +171,7 @@ class Panoramas(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PanoramaArray:
-    """Panoramas in an array, `images` (N, H, W, C) uint8, or at the beginning of a `file` that the
-    array maps.
-    """
+    """Panoramas in an array, `images` (N, H, W, C) uint8, or in a `file` that the array maps."""
 
     stamps_ns: Stamps
     images: Image
@@ -193,13 +187,13 @@ class PanoramaArray:
     def read(self, start: int, stop: int) -> Image:
         if self.file is None:
             return np.asarray(self.images[start:stop])
-        # Read, not mapped: mapped pages would count as memory that grows with the bag.
-        # Several threads read at once: each from a place of its own, in parts of at most 2 GiB.
-        found = np.empty((max(min(stop, len(self)) - start, 0), *self.shape), np.uint8)
-        rest, offset = memoryview(found.reshape(-1)), start * int(np.prod(self.shape))
+        # Mapped pages would count as memory that grows with the bag; preadv is safe in threads,
+        # and reads at most 2 GiB.
+        images = np.empty((max(min(stop, len(self)) - start, 0), *self.shape), np.uint8)
+        rest, offset = memoryview(images.reshape(-1)), start * int(np.prod(self.shape))
         while rest and (read := os.preadv(self.file.fileno(), [rest], offset)):
             rest, offset = rest[read:], offset + read
-        return found
+        return images
 
     def batches(self, size: int) -> Iterator[Image]:
         for start in range(0, len(self), size):
@@ -208,10 +202,10 @@ class PanoramaArray:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One drive: images, odometry, points that were measured, and, for evaluation only, the ground
-    truth.
+    """One drive: images, odometry, measured points and, for evaluation only, the ground truth.
 
-    `counts` holds the used and skipped messages per stream ('images', 'odometry', ...).
+    `counts` holds the used and skipped messages per stream ('images', 'odometry', ...); `camera`
+    is the lever arm of the camera, ahead + i left of base_link, m, if the bag contains it.
     """
 
     name: str
@@ -222,7 +216,6 @@ class Run:
     points: Points | None = None
     counts: dict[str, Count] = field(default_factory=dict)
     camera: complex | None = None
-    """Where the camera sits on the robot, ahead + i left of base_link, m, if the bag says so."""
 
 
 def integrate(stamps_ns: Stamps, twists: Array, start: Array | None = None) -> Array:

@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Base of all settings: typed, with a description, a range and the only default.
+"""Base of all settings: each has a type, a description, a range and the only default.
 
-Each room has its own module `settings`; nodes declare their ROS parameters from its classes,
-and `sfa_localization.config` reads and writes the parameter file from them.
+Each room has a module `settings`; nodes declare their ROS parameters from its classes, and
+`sfa_localization.config` reads and writes the parameter file from them.
 """
 
 from __future__ import annotations
@@ -36,10 +36,8 @@ def setting(
 
     `live` parameters may change while a node runs; the others are read-only after start.
     """
-    bounds = {'low': low, 'high': high, 'choices': choices}
-    return dataclasses.field(
-        default=default, metadata={'doc': doc, 'unit': unit, 'live': live, **bounds}
-    )
+    metadata = {'doc': doc, 'unit': unit, 'live': live, 'low': low, 'high': high}
+    return dataclasses.field(default=default, metadata={'choices': choices, **metadata})
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,22 +57,20 @@ class Settings:
 
         Raises ConfigError for an unknown name, a wrong type or a value out of range.
         """
-        known = {item.name for item in dataclasses.fields(cls)}
+        names = {item.name for item in dataclasses.fields(cls)}
         for name in mapping:
-            if name not in known:
-                raise ConfigError(
-                    f'{where}: unknown parameter {quoted(name)}'
-                    f'{nearest(name, known) or "; known are " + ", ".join(sorted(known))}'
-                )
+            if name not in names:
+                hint = nearest(name, names) or f'; the names are {", ".join(sorted(names))}'
+                raise ConfigError(f'{where}: unknown parameter {quoted(name)}{hint}')
         try:
             return cls(**mapping)
         except ConfigError as error:
             raise ConfigError(f'{where}: {error}') from None
 
 
-def nearest(name: str, known: Collection[str]) -> str:
-    """The end of a message about an unknown name: the most similar known one, or ''."""
-    close = difflib.get_close_matches(name[:100], sorted(known), n=1)
+def nearest(name: str, names: Collection[str]) -> str:
+    """The end of a message about an unknown name: the most similar of the names, or ''."""
+    close = difflib.get_close_matches(name[:100], sorted(names), n=1)
     return f'; did you mean {close[0]!r}?' if close else ''
 
 
@@ -83,28 +79,20 @@ def _converted(where: str, default: Any, value: Any) -> Any:
     if isinstance(default, tuple) and isinstance(value, (list, tuple)):
         kind = default[0] if default else 0.0
         return tuple(_converted(where, kind, entry) for entry in value)
-    if isinstance(default, bool) or isinstance(value, bool):
-        matches = isinstance(default, bool) and isinstance(value, bool)
-    elif isinstance(default, float) and isinstance(value, (int, float)):
+    if isinstance(default, float) and type(value) is int:
         with suppress(OverflowError):  # of an integer beyond all floats
             return float(value)
-        matches = False
-    else:
-        matches = isinstance(value, type(default))
-    if not matches:
+    if isinstance(value, bool) != isinstance(default, bool) or not isinstance(value, type(default)):
         raise ConfigError(f'{where}: {quoted(value)} is not of type {type(default).__name__}')
     return value
 
 
 def _check_bounds(where: str, metadata: Mapping[str, Any], value: Any) -> None:
-    if metadata['choices'] and value not in metadata['choices']:
-        raise ConfigError(
-            f'{where}: {quoted(value)} is not one of {", ".join(filter(None, metadata["choices"]))}'
-        )
-    if not isinstance(value, (int, float)) or isinstance(value, bool):
-        return
+    choices, low, high = metadata['choices'], metadata['low'], metadata['high']
+    if choices and value not in choices:
+        names = ', '.join(filter(None, choices))
+        raise ConfigError(f'{where}: {quoted(value)} is not one of {names}')
     if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f'{where}: {value!r} is not a finite number')
-    low, high = metadata['low'], metadata['high']
     if (low is not None and value < low) or (high is not None and value > high):
         raise ConfigError(f'{where}: {quoted(value)} is outside [{low}, {high}] {metadata["unit"]}')

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Small matrices on one core: beside other work, threads wait for each other 20 times as long."""
+"""Small matrices on one core: on a busy machine, threads would wait for each other."""
 
 from __future__ import annotations
 
@@ -21,5 +21,5 @@ def one_core() -> Iterator[None]:
 
 @lru_cache(maxsize=1)
 def _libraries(with_scipy: bool) -> ThreadpoolController:
-    """NumPy's, and SciPy's where it is imported: to find them takes longer than an image does."""
+    """The BLAS of NumPy, and of SciPy once imported; finding them takes longer than an image."""
     return ThreadpoolController()

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.array_files import read_arrays, write_arrays
 from sfa_localization.data.errors import ModelError
-from sfa_localization.data.files import is_regular
 from sfa_localization.data.run import Run
 from sfa_localization.sfa.network import Architecture, Node
 from sfa_localization.sfa.network_training import Partial
@@ -68,7 +67,7 @@ class Checkpoint:
 
     def read(self, architecture: Architecture) -> Partial | None:
         """The stages finished so far; None when there are none. Raises ModelError."""
-        if not is_regular(self.path):
+        if not self.path.is_file():
             return None
         remedy = 'train without --resume'
         arrays = read_arrays(self.path, FORMAT, VERSION, remedy)
