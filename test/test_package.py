@@ -187,7 +187,8 @@ def test_one_version():
     assert (manifest.get('format'), manifest.findtext('export/build_type')) == ('3', 'ament_python')
     assert manifest.findtext('version') == setup_arguments()['version']
     assert setup_arguments()['version'] == sfa_localization.__version__
-    assert f'## {sfa_localization.__version__}' in (ROOT / 'CHANGELOG.md').read_text('utf-8')
+    changes = (ROOT / 'CHANGELOG.rst').read_text('utf-8')
+    assert f'Changelog for package {NAME}\n' in changes and '\nForthcoming\n---' in changes
     citation = (ROOT / 'CITATION.cff').read_text('utf-8')
     assert f'version: {sfa_localization.__version__}\n' in citation
 
