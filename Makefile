@@ -48,8 +48,8 @@ fuzz: $(READY)  ## thousands of damaged messages, models, bags, YAML and image f
 soak: $(READY)  ## run the three nodes for an hour at 20x; nothing may grow (ARGS='--seconds 800')
 	PYTHONPATH=. $(PY) test/benchmarks/soak.py $(ARGS)
 
-bench: $(READY)  ## ten minutes on an idle machine: compare speeds, write the table of test/README.md (ARGS=--quick)
-	PYTHONPATH=. $(PY) test/benchmarks/bench_all.py $(if $(wildcard demo/model.npz),--model demo/model.npz --drive demo/test) $(ARGS)
+bench: $(READY)  ## speeds beside the last release, on an idle machine; writes the table of test/README.md (ARGS=--quick)
+	$(PY) test/benchmarks/bench_all.py $(ARGS)
 
 lint: $(READY)  ## ruff, ruff format, mypy, lines of each room beside its budget
 	$(VENV)/bin/ruff check .

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of test/README.md that programs write: `<!-- NAME -->`, the table, `<!-- end -->`."""
 
-import os
 import re
 from pathlib import Path
 
@@ -21,6 +20,4 @@ def write_table(name, table):
     mark = re.compile(rf'(<!-- {name} -->\n).*?(<!-- end -->\n)', re.DOTALL)
     text, count = mark.subn(lambda match: match[1] + table + match[2], PAGE.read_text('utf-8'))
     assert count == 1, f'{PAGE}: lacks <!-- {name} --> and <!-- end -->'
-    temporary = PAGE.with_name('.README.md.tmp')
-    temporary.write_text(text, 'utf-8')
-    os.replace(temporary, PAGE)
+    PAGE.write_text(text, 'utf-8')
