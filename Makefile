@@ -34,7 +34,8 @@ study: $(READY)  ## one of these studies, a year, or half-real bags (ARGS='basel
 test: $(READY)  ## run all tests, several files at once (ARGS='-k bag' for some of them)
 	$(PY) -m pytest $(PARALLEL) $(ARGS)
 
-robustness: $(READY)  ## run the tests of test/README.md; print what each fault of a drive did (20 minutes)
+robustness: $(READY)  ## run the tests of faults, write their table, print what each fault of a drive did (20 minutes)
+	PYTHONPATH=.:test $(PY) -m robustness --page
 	$(PY) -m pytest -m robustness $(ARGS)
 	PYTHONPATH=.:test $(PY) -m robustness --live --lights
 
@@ -47,8 +48,8 @@ fuzz: $(READY)  ## thousands of damaged messages, models, bags, YAML and image f
 soak: $(READY)  ## run the three nodes for an hour at 20x; nothing may grow (ARGS='--seconds 800')
 	PYTHONPATH=. $(PY) test/benchmarks/soak.py $(ARGS)
 
-bench: $(READY)  ## ten minutes on an idle machine: compare speeds, write the table of test/README.md (ARGS=--quick)
-	PYTHONPATH=. $(PY) test/benchmarks/bench_all.py $(if $(wildcard demo/model.npz),--model demo/model.npz --drive demo/test) $(ARGS)
+bench: $(READY)  ## speeds beside the last release, on an idle machine; writes the table of test/README.md (ARGS=--quick)
+	$(PY) test/benchmarks/bench_all.py $(ARGS)
 
 lint: $(READY)  ## ruff, ruff format, mypy, lines of each room beside its budget
 	$(VENV)/bin/ruff check .

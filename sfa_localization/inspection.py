@@ -373,7 +373,6 @@ class _Survey:
         is_panorama = camera is not None and camera.is_panorama
         report.motion = check_motion(odometry, turns, gyro, is_panorama, views)
 
-
     def _camera_tilt(self, path_m: Array) -> str:
         """How the ground tilts the camera, by pairs of images after `path_m` (N,) of driving."""
         if len({textures.shape for textures in self._textures.values()}) != 1:

@@ -8,7 +8,7 @@ import tempfile
 from types import SimpleNamespace
 
 import pytest
-from robustness.readme import robustness_table
+from robustness.promises import PROMISES
 
 # Before rclpy is imported by any test; a user's own choice stands.
 _LOGS = tempfile.TemporaryDirectory(prefix='sfa_localization_ros_log_')
@@ -35,12 +35,11 @@ def pytest_addoption(parser):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection_modifyitems(config, items):
-    """Mark the tests that README.md names; then, with --one-each, keep the first case of each test
-    that `-m` and `-k` have left.
+    """Mark the tests of faults; then, with --one-each, keep the first case of each test that `-m`
+    and `-k` select.
     """
-    named = {test for tests in robustness_table().values() for test in tests}
     for item in items:
-        if (item.path.name, getattr(item, 'originalname', item.name)) in named:
+        if f'{item.path.name}::{getattr(item, "originalname", item.name)}' in PROMISES:
             item.add_marker(pytest.mark.robustness)
     yield
     if config.getoption('--one-each'):

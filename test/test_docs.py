@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The documents name only existing commands, options, executables, topics, parameters and files.
+"""The pages name only existing commands, options, topics, parameters, files and tests.
 
-Commands marked `run:` in the README are run in test_readme_commands.py; the others are checked
-here, as far as possible without the ROS 2 command line.
+Commands marked `run:` are run in test_readme_commands.py; the others are checked here, as far as
+possible without the ROS 2 command line.
 """
 
 import ast
@@ -21,6 +21,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from picture_readers import SIZE, PictureReader
+from robustness import promises
 from study.__main__ import study_parser
 
 from sfa_localization import cli
@@ -28,38 +30,39 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.data.settings import Settings
 from sfa_localization.nodes.entry import CANNOT_START, DIED
 from sfa_localization.nodes.settings import EkfNodeConfig
+from sfa_localization.place_model import PlaceModel
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [*ROOT.glob('*.md'), *ROOT.glob('config/*.md'), *ROOT.glob('bags/*.md'),
-             *ROOT.glob('test/*.md')]  # fmt: skip
+PAGES = {
+    path.relative_to(ROOT).as_posix(): path.read_text('utf-8')
+    for pattern in ('*.md', 'config/*.md', 'bags/*.md', 'test/*.md')
+    for path in ROOT.glob(pattern)
+}
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 BLOCK = re.compile(r'```(?:bash|sh)\n(.*?)```', re.DOTALL)
-INLINE = re.compile(r'`([a-z_]+ [^`]+)`')
+INLINE = re.compile(r'`((?:sfa_localization|make) [^`]+)`')
 LINK = re.compile(r'\]\(([^)#\s]+)\)')
 TOPIC = re.compile(r'\b((?:sfa|ekf)/[a-z_]+)\b')
+TEST_NAME = re.compile(r'`(test_\w+\.py)::(\w+)`')
 # Programs of other packages, whose arguments are not checked.
 FOREIGN = {'source', 'colcon', 'rviz2', 'rosdep', 'git', 'cd', 'mkdir', 'pip', 'sudo'}
 FOREIGN_ROS = {'run robot_localization', 'launch nav2_bringup', 'bag record', 'topic echo'}
 
 
-def command_lines() -> dict[str, list[str]]:
-    """Return the words of every command line in the documents, by its page and text."""
-    found = {}
-    for path in DOCUMENTS:
-        text = path.read_text('utf-8')
-        blocks = '\n'.join(BLOCK.findall(text)).replace('\\\n', ' ')
-        inline = [c for c in INLINE.findall(text) if c.split()[0] in {'sfa_localization', 'make'}]
-        for line in [*blocks.splitlines(), *inline]:
-            if words := shlex.split(line, comments=True):
-                found[f'{path.name}: {line.strip()}'] = words
-    return found
+def command_lines() -> list[str]:
+    """Return every command line of the pages."""
+    lines = []
+    for text in PAGES.values():
+        blocks = ''.join(BLOCK.findall(text)).replace('\\\n', ' ')
+        lines += [*blocks.splitlines(), *INLINE.findall(text)]
+    return [line for line in lines if shlex.split(line, comments=True)]
 
 
 def test_every_command_exists():
     lines, wrong = command_lines(), {}
-    for line, words in lines.items():
+    for line in lines:
         try:
-            check(*words)
+            check(*shlex.split(line, comments=True))
         except (AssertionError, SystemExit, ValueError, subprocess.CalledProcessError) as error:
             wrong[line] = repr(error)
     assert len(lines) > 50 and wrong == {}
@@ -75,10 +78,8 @@ def check(program: str, *words: str) -> None:
         subprocess.run(['make', '--dry-run', *targets], cwd=ROOT, check=True, capture_output=True)
     elif program == 'python' and words[:2] == ('-m', 'sfa_localization'):
         check_command(*words[2:])
-    elif program == 'sfa_localization':
-        check_command(*words)
-    elif program in NODES:
-        check_node(program, list(words))
+    elif program == 'sfa_localization' or program in NODES:
+        check_command(*(() if program == 'sfa_localization' else (program,)), *words)
     else:
         assert program in FOREIGN, f'unknown program {program}'
 
@@ -95,24 +96,19 @@ def check_ros2(*words: str) -> None:
         check_command(name, *rest)
         return
     source = (ROOT / 'config' / name).read_text('utf-8')
-    known = set(re.findall(r"DeclareLaunchArgument\(\s*'(\w+)'", source))
-    assert {word.partition(':=')[0] for word in rest} <= known | {'--show-args'}
+    arguments = set(re.findall(r"DeclareLaunchArgument\(\s*'(\w+)'", source))
+    assert {word.partition(':=')[0] for word in rest} <= arguments | {'--show-args'}
 
 
 def check_command(name: str, *words: str) -> None:
-    if name in NODES:
-        check_node(name, list(words))
+    if name in NODES:  # with parameters that are settings, and remapped topics of its own
+        assert words[:1] in ((), ('--ros-args',), ('...',))
+        for option, value in zip(words[1::2], words[2::2], strict=True):
+            names = {'-p': parameters(), '-r': topics(), '--params-file': {value}}[option]
+            assert value.partition(':=')[0].lstrip('/') in names
     elif name not in ('COMMAND', '--help') and words not in (('...',), ('--help',)):
         assert name in cli.COMMANDS, f'unknown command {name}'
         cli.command_parser(name).parse_args(words)
-
-
-def check_node(name: str, words: list[str]) -> None:
-    """Parameters of a node are settings, and remapped topics are its own."""
-    assert words[:1] in ([], ['--ros-args'], ['...'])
-    for option, value in zip(words[1::2], words[2::2], strict=True):
-        known = {'-p': parameters(), '-r': topics(), '--params-file': {value}}[option]
-        assert value.partition(':=')[0].lstrip('/') in known
 
 
 def parameters() -> set[str]:
@@ -123,7 +119,7 @@ def parameters() -> set[str]:
 
 def topics() -> set[str]:
     """Return the topics that the nodes name in their source, without leading slashes."""
-    sources = [ROOT / 'sfa_localization' / 'nodes' / f'{name}.py' for name in NODES]
+    sources = (ROOT / f'sfa_localization/nodes/{name}.py' for name in NODES)
     strings = (
         node.value
         for path in sources
@@ -134,15 +130,58 @@ def topics() -> set[str]:
 
 
 def test_links_and_topics_exist():
-    named = {path: path.read_text('utf-8') for path in [*DOCUMENTS, *ROOT.glob('config/*.rviz')]}
     broken = [
-        (path.name, target)
-        for path, text in named.items()
+        (page, target)
+        for page, text in PAGES.items()
         for target in LINK.findall(text)
-        if not target.startswith('https://') and not (path.parent / target).exists()
+        if not target.startswith('https://') and not (ROOT / page).parent.joinpath(target).exists()
     ]
     assert broken == []
-    assert {p.name: t for p, x in named.items() if (t := set(TOPIC.findall(x)) - topics())} == {}
+    texts = [*PAGES.values(), (ROOT / 'config/localization.rviz').read_text('utf-8')]
+    assert set(TOPIC.findall(''.join(texts))) <= topics()
+
+
+TOPIC_ROW = re.compile(r'^\| `(\w[\w/]+)` \| (\w+) \|([^|]+)\|([^|]+)\|', re.MULTILINE)
+OTHER_TOPICS = re.compile(r'/(rosout|parameter_events|diagnostics|tf|\w+/transition_event)')
+
+
+@pytest.mark.ros
+def test_the_table_of_topics_is_that_of_the_nodes(bench, monkeypatch):
+    from ros_bench import until
+
+    from sfa_localization.nodes import ekf_node, omnicam_node, sfa_node
+
+    monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
+    size = {'width': SIZE.width, 'height': SIZE.height}
+    nodes = [
+        bench.run(omnicam_node.OmnicamNode, camera_model='panorama', level_by_imu=True, **size),
+        bench.run(sfa_node.SfaNode, model='model.npz'),
+        bench.run(ekf_node.EkfNode),
+    ]
+
+    def topics_of(entities):
+        return {
+            (entity.topic_name[1:], entity.msg_type.__name__, f' `{node.get_name()}` ')
+            for node in nodes for entity in getattr(node, entities)
+            if not OTHER_TOPICS.fullmatch(entity.topic_name)
+        }  # fmt: skip
+
+    rows = TOPIC_ROW.findall(PAGES['config/README.md'])
+    published = {(topic, kind, node) for topic, kind, node, _ in rows if '_node' in node}
+    read = {(topic, kind, node) for topic, kind, _, node in rows if '_node' in node}
+    raw = {row for row in read if not row[0].endswith('/compressed')}
+    assert topics_of('publishers') == published
+    assert until(lambda: topics_of('subscriptions') == raw)
+
+
+def test_the_printed_inspection_is_that_of_the_sample(capsys, monkeypatch):
+    """But for its figures."""
+    monkeypatch.chdir(ROOT)
+    assert cli.main(['inspect', 'bags/sample']) == 0
+    printed = re.search(r'```text\n(.*?)```', PAGES['bags/README.md'], re.DOTALL)[1]
+    assert re.sub(r'-?[\d.]+', '#', capsys.readouterr().out).split() == (
+        re.sub(r'-?[\d.]+', '#', printed).split()
+    )
 
 
 def test_foxglove_layout_is_complete_and_its_topics_exist():
@@ -165,11 +204,11 @@ def test_robot_localization_finds_a_robot_that_starts_anywhere(launch):
     used = [index for index, wanted in enumerate(settings['pose0_config']) if wanted]
     assert used == [0, 1, 5], 'x, y and yaw'
     covariance = np.reshape(settings['initial_estimate_covariance'], (15, 15))
-    apart = np.array([200.0, -200.0, math.pi])
-    d2 = apart @ np.linalg.solve(covariance[np.ix_(used, used)], apart)
+    distant = np.array([200.0, -200.0, math.pi])
+    d2 = distant @ np.linalg.solve(covariance[np.ix_(used, used)], distant)
     assert d2 <= settings['pose0_rejection_threshold'] ** 2
-    text = (ROOT / 'config/robot_localization.md').read_text('utf-8')
-    (line,) = (line for line in text.splitlines() if line.startswith('ros2 launch'))
+    lines = PAGES['config/robot_localization.md'].splitlines()
+    (line,) = (line for line in lines if line.startswith('ros2 launch'))
     arguments = dict(word.split(':=') for word in shlex.split(line)[4:])
     assert [*launch(**arguments)] == ['omnicam_node', 'sfa_node'], 'no second filter'
 
@@ -193,7 +232,7 @@ def test_nav2_uses_our_frames():
 
 
 class Recorded:
-    """Replaces every class of launch, and records its arguments."""
+    """In the place of each class of launch: records its arguments."""
 
     def __init__(self, *given, **named):
         self.given, self.named = given, named
@@ -201,24 +240,15 @@ class Recorded:
 
 @pytest.fixture
 def launch_file(monkeypatch):
-    """Return what is in the launch file, with launch replaced by stand-ins."""
-    names = {
-        'launch': ['LaunchContext', 'LaunchDescription'],
-        'launch.actions': ['DeclareLaunchArgument', 'OpaqueFunction'],
-        'launch.conditions': ['IfCondition'],
-        'launch.events': [],
-        'launch.events.process': ['ProcessExited'],
-        'launch.substitutions': ['LaunchConfiguration', 'PathJoinSubstitution'],
-        'launch_ros.actions': ['Node', 'PushROSNamespace'],
-        'launch_ros.parameter_descriptions': ['ParameterValue'],
-        'launch_ros.substitutions': ['FindPackageShare'],
-    }
-    for name, classes in {'launch_ros': [], **names}.items():
-        module = types.ModuleType(name)
-        for each in classes:
-            setattr(module, each, type(each, (Recorded,), {}))
-        monkeypatch.setitem(sys.modules, name, module)
-    return runpy.run_path(str(ROOT / 'config/localization.launch.py'))
+    """Return the names of the launch file, with launch replaced by stand-ins."""
+    path = ROOT / 'config/localization.launch.py'
+    imports = re.findall(
+        r'^from (launch[\w.]*) import (.+)$', path.read_text('utf-8'), re.MULTILINE
+    )
+    for module, names in imports:
+        classes = dict.fromkeys(names.split(', '), Recorded)
+        monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**classes))
+    return runpy.run_path(str(path))
 
 
 @pytest.fixture
@@ -228,17 +258,16 @@ def launch(launch_file):
     def start(**arguments):
         (actions,) = launch_file['generate_launch_description']().given
         *declared, nodes = actions
-        given = {action.given[0]: action.named.get('default_value') for action in declared}
-        assert set(arguments) <= set(given)
-        given.update({'config': ROOT / 'config/localization.yaml', **arguments})
-        context = types.SimpleNamespace(launch_configurations=given)
+        values = {action.given[0]: action.named.get('default_value') for action in declared}
+        assert set(arguments) <= set(values)
+        values.update({'config': ROOT / 'config/localization.yaml', **arguments})
+        context = types.SimpleNamespace(launch_configurations=values)
         namespace, *nodes = nodes.named['function'](context)
         assert namespace.given == (arguments.get('namespace', ''),)
-        always = Recorded('true')
         return {
             node.named['executable']: node.named
             for node in nodes
-            if node.named.get('condition', always).given == always.given
+            if node.named.get('condition', Recorded('true')).given == ('true',)
         }
 
     return start
@@ -249,10 +278,9 @@ def test_launch_file_starts_all_nodes_with_known_parameters_and_topics(launch):
     launched, without = launch(model='model.npz'), launch(panorama='/panorama')
     assert [*launched] == list(NODES) and [*without] == ['sfa_node', 'ekf_node']
     for node in [*launched.values(), *without.values()]:
-        _file, given = node['parameters']
-        assert set(given) <= parameters()
-        known = topics() | {'image_raw', 'odom', '/tf'}
-        assert {source for source, _ in node['remappings']} <= known
+        assert set(node['parameters'][1]) <= parameters()
+        sources = {source for source, _ in node['remappings']}
+        assert sources <= topics() | {'image_raw', 'odom', '/tf'}
     assert ('/tf', 'tf') in launched['ekf_node']['remappings']
     assert ('/tf', '/tf') in launch(tf='/tf')['ekf_node']['remappings']
     assert [*launch(ekf='false')] == ['omnicam_node', 'sfa_node']
@@ -280,8 +308,7 @@ def test_a_launch_ends_with_what_cannot_start_and_starts_again_what_dies(launch,
 
 
 def test_the_replay_of_the_readme_feeds_the_launched_nodes(launch):
-    text = (ROOT / 'README.md').read_text('utf-8')
-    (block,) = (block for block in BLOCK.findall(text) if 'ros2 bag play' in block)
+    (block,) = (block for block in BLOCK.findall(PAGES['README.md']) if 'ros2 bag play' in block)
     typed, played = (shlex.split(line, comments=True) for line in block.splitlines())
     launched = launch(**dict(word.split(':=') for word in typed[4:]))
     assert [*launched] == ['sfa_node', 'ekf_node'], 'the bag holds panoramas'
@@ -294,17 +321,18 @@ def test_the_replay_of_the_readme_feeds_the_launched_nodes(launch):
     assert held[f'/{odometry}'] == 'nav_msgs/msg/Odometry'
 
 
-TEST_NAME = re.compile(r'`(test_\w+\.py)::(\w+)`')
+def test_pages_name_tests_that_exist():
+    """And test/README.md shows the faults of promises.py."""
+    problems, faults = PAGES['config/problems.md'], PAGES['test/README.md']
+    assert promises.table() in faults, 'run: PYTHONPATH=.:test python -m robustness --page'
+    names = TEST_NAME.findall(problems + faults)
+    missing = [n for n in names if f'def {n[1]}(' not in (ROOT / 'test' / n[0]).read_text('utf-8')]
+    assert len(names) > 50 and missing == []
 
 
-def test_pages_name_tests_that_there_are_and_states_that_are_said():
-    """And each row of the tables of problems has a cause and a remedy."""
-    for page in ('config/problems.md', 'test/README.md'):
-        named = TEST_NAME.findall((ROOT / page).read_text('utf-8'))
-        sources = {file: (ROOT / 'test' / file).read_text('utf-8') for file, _ in named}
-        assert [n for n in named if f'def {n[1]}' not in sources[n[0]]] == [] and len(named) > 10
-    text = (ROOT / 'config/troubleshooting.md').read_text('utf-8')
-    rows = [row.strip('|').split('|') for row in text.splitlines() if row.startswith('| `')]
+def test_each_reason_of_troubleshooting_is_in_the_code_with_cause_and_remedy():
+    lines = PAGES['config/troubleshooting.md'].splitlines()
+    rows = [row.strip('|').split('|') for row in lines if row.startswith('| `')]
     assert all(len(row) == 3 and all(cell.strip() for cell in row) for row in rows)
     code = ' '.join(path.read_text('utf-8') for path in (ROOT / 'sfa_localization').rglob('*.py'))
     code = re.sub(r"'\s+f?'", '', code)  # texts that go on in the next line

@@ -8,7 +8,6 @@ import statistics
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
 from functools import cache, partial
 from pathlib import Path
 from unittest import mock
@@ -73,9 +72,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
 SETTINGS_ONLY = {('config', 'nodes')}
 # Never at run time on the robot, nor in anything its nodes import.
 NOT_ON_THE_ROBOT = {'mdp', 'pickle', 'matplotlib', 'trimesh', 'embreex', 'rosbags', 'tqdm'}
-OWN_NOT_ON_THE_ROBOT = {
-    f'{NAME}.{word}' for word in ('training', 'evaluation', 'updating', 'simulation')
-}
+OFFLINE = {f'{NAME}.{room}' for room in ('training', 'evaluation', 'updating', 'simulation')}
 # Modules that run code from the files that they read.
 UNSAFE = {'pickle', 'marshal', 'shelve', 'dill', 'joblib'}
 
@@ -83,7 +80,7 @@ UNSAFE = {'pickle', 'marshal', 'shelve', 'dill', 'joblib'}
 @cache
 def imports(module: str) -> frozenset[str]:
     """Return the full names a module imports, anywhere in it, but not for type checkers only."""
-    found: set[str] = set()
+    names: set[str] = set()
     skipped: set[ast.AST] = set()
     for node in ast.walk(ast.parse(MODULES[module].read_text(encoding='utf-8'))):
         if isinstance(node, ast.If) and 'TYPE_CHECKING' in ast.unparse(node.test):
@@ -91,26 +88,25 @@ def imports(module: str) -> frozenset[str]:
         if node in skipped:
             continue
         if isinstance(node, ast.Import):
-            found.update(alias.name for alias in node.names)
+            names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f'{module}: relative import'
-            found.update(f'{node.module}.{alias.name}' for alias in node.names)
-    return frozenset(found)
+            names.update(f'{node.module}.{alias.name}' for alias in node.names)
+    return frozenset(names)
 
 
-def own(module: str) -> set[str]:
+def internal(module: str) -> set[str]:
     """Return the modules of this package that a module imports."""
-    names = {name for name in imports(module) if name.split('.')[0] == NAME}
-    return {longest(name, MODULES) for name in names}
+    return {module_of(name) for name in imports(module) if name.split('.')[0] == NAME}
 
 
-def longest(name: str, beginnings: Iterable[str]) -> str:
-    """Return the longest of the beginnings that fits a dotted name."""
-    return max((b for b in beginnings if f'{name}.'.startswith(f'{b}.')), key=len)
+def module_of(name: str) -> str:
+    """Return the module that holds a dotted name of this package."""
+    return max((module for module in MODULES if f'{name}.'.startswith(f'{module}.')), key=len)
 
 
-def foreign(module: str) -> set[str]:
-    """Return the top-level packages, neither own nor standard, that a module imports."""
+def external(module: str) -> set[str]:
+    """Return the top-level packages, neither this nor standard, that a module imports."""
     tops = {name.split('.')[0] for name in imports(module)}
     return tops - {NAME} - set(sys.stdlib_module_names)
 
@@ -121,7 +117,7 @@ def reached(start: str) -> set[str]:
     while todo:
         module = todo.pop()
         seen.add(module)
-        todo |= own(module) - seen
+        todo |= internal(module) - seen
     return seen
 
 
@@ -131,20 +127,15 @@ def room(module: str) -> str:
 
 
 def wrong_imports(module: str) -> set[str]:
-    """Return which of the full names that a module imports its room may not have."""
+    """Return the modules and packages that a module imports, but its room may not."""
     rooms, packages = ROOMS[room(module)]
-    wrong = set()
-    for name in imports(module):
-        top = name.split('.')[0]
-        if top != NAME:
-            allowed = top in packages or top in sys.stdlib_module_names
+    wrong = external(module) - packages
+    for target in internal(module):
+        if (room(module), room(target)) in SETTINGS_ONLY:
+            allowed = target.endswith('.settings')
         else:
-            target = longest(name, MODULES)
             allowed = room(target) in rooms | {room(module)}
-            if (room(module), room(target)) in SETTINGS_ONLY:
-                allowed = target.endswith('.settings')
-        if not allowed:
-            wrong.add(name)
+        wrong |= set() if allowed else {target}
     return wrong
 
 
@@ -153,9 +144,8 @@ def test_modules_import_only_what_their_rooms_may():
     assert set(ROOMS) == {room(module) for module in MODULES}
     assert {m: wrong for m in MODULES if (wrong := wrong_imports(m))} == {}
     assert [m for m in MODULES if {name.split('.')[0] for name in imports(m)} & UNSAFE] == []
-    with_ros = {room(module) for module in MODULES if foreign(module) & ROS}
-    assert with_ros == {'nodes', 'commands'}
-    circles = [m for m in MODULES if any(m in reached(other) for other in own(m) - {m})]
+    assert {room(module) for module in MODULES if external(module) & ROS} == {'nodes', 'commands'}
+    circles = [m for m in MODULES if any(m in reached(other) for other in internal(m) - {m})]
     assert circles == []
     diagram = (ROOT / 'CONTRIBUTING.md').read_text('utf-8').split('```')[1]
     assert [name for name in ROOMS if name[0] != '_' and name not in diagram] == []
@@ -178,8 +168,8 @@ def test_functions_are_short():
 
 def test_robot_needs_no_training_code():
     modules = set().union(*(reached(f'{NAME}.nodes.{node}') for node in NODES))
-    assert not modules & OWN_NOT_ON_THE_ROBOT
-    assert {m: bad for m in modules if (bad := foreign(m) & NOT_ON_THE_ROBOT)} == {}
+    assert not modules & OFFLINE
+    assert {m: bad for m in modules if (bad := external(m) & NOT_ON_THE_ROBOT)} == {}
 
 
 def test_one_version():
@@ -187,7 +177,8 @@ def test_one_version():
     assert (manifest.get('format'), manifest.findtext('export/build_type')) == ('3', 'ament_python')
     assert manifest.findtext('version') == setup_arguments()['version']
     assert setup_arguments()['version'] == sfa_localization.__version__
-    assert f'## {sfa_localization.__version__}' in (ROOT / 'CHANGELOG.md').read_text('utf-8')
+    changes = (ROOT / 'CHANGELOG.rst').read_text('utf-8')
+    assert f'Changelog for package {NAME}\n' in changes and '\nForthcoming\n---' in changes
     citation = (ROOT / 'CITATION.cff').read_text('utf-8')
     assert f'version: {sfa_localization.__version__}\n' in citation
 
@@ -203,20 +194,15 @@ def setup_arguments(command: str = 'bdist_wheel') -> dict:
     return arguments
 
 
-def executables(command: str) -> dict[str, str]:
-    """Return the installed executables and their entry points."""
-    lines = setup_arguments(command)['entry_points']['console_scripts']
-    return dict(line.split(' = ') for line in lines)
-
-
 def test_pip_installs_one_command_and_the_nodes_and_colcon_every_command_for_ros2_run():
-    nodes = {node: f'{NAME}.nodes.entry:{node}' for node in NODES}
-    for command in ('bdist_wheel', 'editable_wheel', 'dist_info'):
-        assert executables(command) == {NAME: f'{NAME}.cli:main', **nodes}
-        assert not [name for name in setup_arguments(command)['packages'] if 'study' in name]
-    commands = dict.fromkeys(COMMANDS, f'{NAME}.cli:executable')
-    for command in ('install', 'develop'):
-        assert executables(command) == executables('bdist_wheel') | commands
+    for command in ('bdist_wheel', 'editable_wheel', 'dist_info', 'install', 'develop'):
+        arguments = setup_arguments(command)
+        lines = arguments['entry_points']['console_scripts']
+        executables = {Path(name).name for name in arguments.get('scripts', ())}
+        executables |= {line.split(' = ')[0] for line in lines}
+        commands = set(COMMANDS) if command in ('install', 'develop') else set()
+        assert executables == {NAME, *NODES, *commands}
+        assert not [name for name in arguments['packages'] if 'test' in name or 'study' in name]
 
 
 @pytest.mark.parametrize(
@@ -262,7 +248,7 @@ def test_what_is_installed_exists():
     assert [path for path in files if not path.is_file()] == []
     assert (PACKAGE / 'py.typed').is_file()
     keys = {item.text for item in ET.parse(ROOT / 'package.xml').getroot().iter('exec_depend')}
-    assert set().union(*(foreign(module) & ROS for module in MODULES)) <= keys
+    assert set().union(*(external(module) & ROS for module in MODULES)) <= keys
 
 
 def test_the_help_of_each_command_shows_examples_and_what_it_writes():

@@ -97,10 +97,10 @@ def compare(log: str) -> dict[str, dict[str, float]]:
     rejected = np.array([stamp_ns for stamp_ns, fits in fates if not fits])
     plain = judged(truth, np.array(stamps), np.array(poses), np.array(covariances), rejected,
                    positions)  # fmt: skip
-    found = filtering.run_filter(odometry, positions, FilterConfig())
-    judgeable = [update for update in found.updates if np.isfinite(update.d2)]
+    result = filtering.run_filter(odometry, positions, FilterConfig())
+    judgeable = [update for update in result.updates if np.isfinite(update.d2)]
     rejected = np.array([update.stamp_ns for update in judgeable if not update.accepted])
-    ours = judged(truth, found.stamps_ns, found.poses, found.covariances, rejected, positions)
+    ours = judged(truth, result.stamps_ns, result.poses, result.covariances, rejected, positions)
     return {'plain': plain, 'ours': ours}
 
 

@@ -4,5 +4,5 @@
 
 `recorded` holds the drive and the model for it, `messages` what a robot hears, `faults` what goes
 wrong; `replay` and `live` run it through the Localizer and the three nodes, `frozen` through the
-filter alone, `judged` compares with the truth. `readme` reads the table of test/README.md.
+filter alone, `judged` compares with the truth. `promises` lists the tests of each fault.
 """

@@ -11,7 +11,9 @@ import os
 import sys
 import tempfile
 
-from robustness import frozen
+from page_tables import write_table
+
+from robustness import frozen, promises
 from robustness.faults import FAULTS, LIES
 from robustness.judged import head, judge, row, summary
 from robustness.recorded import OTHER_LIGHTS, two_laps
@@ -81,10 +83,14 @@ def main():
         ('--lights', 'also in other lights and seasons'),
         ('--frozen', 'the filter alone, on what was recorded by day and in the evening'),
         ('--means', 'the same; keep the mean errors, which test_frozen.py lets get no worse'),
+        ('--page', 'only write the faults of promises.py into test/README.md'),
         ('--record', 'locate all images anew: after training, features or keyframes change'),
     ):
         parser.add_argument(option, action='store_true', help=text)
     options = parser.parse_args()
+    if options.page:
+        write_table('faults', promises.table())
+        return 0
     if options.record:
         frozen.record(tell)
         return 0

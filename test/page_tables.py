@@ -1,0 +1,23 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of test/README.md that programs write: `<!-- NAME -->`, the table, `<!-- end -->`."""
+
+import re
+from pathlib import Path
+
+PAGE = Path(__file__).with_name('README.md')
+
+
+def markdown(header, rows):
+    """Return a table; columns whose name ends with a colon are right aligned."""
+    ruler = ['---:' if name.endswith(':') else '---' for name in header]
+    lines = [name.rstrip(':') for name in header], ruler, *rows
+    return ''.join(f'| {" | ".join(line)} |\n' for line in lines)
+
+
+def write_table(name, table):
+    """Replace the table of this name on the page."""
+    mark = re.compile(rf'(<!-- {name} -->\n).*?(<!-- end -->\n)', re.DOTALL)
+    text, count = mark.subn(lambda match: match[1] + table + match[2], PAGE.read_text('utf-8'))
+    assert count == 1, f'{PAGE}: lacks <!-- {name} --> and <!-- end -->'
+    PAGE.write_text(text, 'utf-8')
