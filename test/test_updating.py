@@ -16,7 +16,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.run import Odometry
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.updating import Additions, explained_quantile, extended, new_views
+from sfa_localization.updating import Additions, usual_explained_part, extended, new_views
 
 
 def repainted(share):
@@ -121,7 +121,7 @@ def in_the_sun(seed):
 def test_images_of_another_light_become_keyframes():
     """Those of the training are explained by each other, and these are less."""
     model = place().model
-    familiar, new = explained_quantile(model), new_views(model, in_the_sun(5))
+    familiar, new = usual_explained_part(model), new_views(model, in_the_sun(5))
     newer, further = extended(model, new, 'sun'), in_the_sun(8)
     explained = [
         np.median([e.explained for e in one.locate_all(some_images(further))])
@@ -145,7 +145,7 @@ def test_network_maps_and_first_keyframes_stay_also_in_its_file(tmp_path):
     np.testing.assert_array_equal(read.keyframes.drives, newer.keyframes.drives)
     assert read.keyframes.trained == newer.keyframes.trained == 1
     assert read.quality['updates'] == [{'bag': 'later', 'images': len(new)}]
-    assert explained_quantile(read) == pytest.approx(explained_quantile(place().model))
+    assert usual_explained_part(read) == pytest.approx(usual_explained_part(place().model))
     image = drive().panoramas.read(30, 31)[0]
     np.testing.assert_allclose(read.locate(image).position, newer.locate(image).position)
 
