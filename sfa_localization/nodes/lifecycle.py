@@ -215,14 +215,11 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         return False
 
     def refuse(self, topic: str, reason: str) -> int:
-        """Count a rejected message; log the first of a reason, then each thousandth.
-
-        Returns how often this reason has occurred.
-        """
+        """Count a rejection; log the first of a reason and each thousandth; return the count."""
         count = self.monitors[topic].refused.add(reason)
         if count == 1 or count % 1000 == 0:
-            line = f'{self.full_name(topic)}: {short_line(reason)} ({count} so far)'
-            self.get_logger().warning(line)
+            where = self.full_name(topic)
+            self.get_logger().warning(f'{where}: {short_line(reason)} ({count} so far)')
         return count
 
     def defect(self, name: str, error: Exception) -> None:
