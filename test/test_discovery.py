@@ -41,11 +41,10 @@ def takes_another(node, topic):
     return node.full_name(topic) != node.resolve_topic_name(topic)
 
 
-def test_odometry_of_another_name_is_found(bench):
-    """And images."""
+def test_inputs_of_another_name_are_taken(bench):
     node = bench.run(EkfNode)
-    zero, one, frames = np.zeros(3), np.eye(3), ('odom', 'base_link')
-    message = to_odometry(zero, one, zero[:2], one[:2, :2], STAMP_NS, frames)
+    zero, unit, frames = np.zeros(3), np.eye(3), ('odom', 'base_link')
+    message = to_odometry(zero, unit, zero[:2], unit[:2, :2], STAMP_NS, frames)
     used = node.monitors['odom']
     assert bench.publish_until('/wheel_odometry', message, lambda: used.received)
     assert node.full_name('odom') == '/wheel_odometry', 'diagnostics name the topic that is used'
@@ -59,8 +58,8 @@ def test_odometry_of_another_name_is_found(bench):
 
 
 @pytest.mark.parametrize(('others', 'arguments'), [
-    (['/one', '/two'], []), (['/one', '/odom'], []),
-    (['/one'], ['--ros-args', '-r', 'odom:=/mine']),
+    (['/a', '/b'], []), (['/a', '/odom'], []),
+    (['/a'], ['--ros-args', '-r', 'odom:=/mine']),
     (['/robot2/wheels'], ['--ros-args', '-r', '__ns:=/robot1']),
 ])  # fmt: skip
 def test_where_there_is_a_choice_it_is_not_made(bench, others, arguments):

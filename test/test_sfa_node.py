@@ -34,7 +34,7 @@ from sfa_localization.nodes.sfa_node import SfaNode
 
 pytestmark = pytest.mark.ros
 SIZE = PanoramaConfig(width=60, height=12)
-KNOWN = ErrorCorrelation(0.25, 1.5)
+CORRELATION = ErrorCorrelation(0.25, 1.5)
 
 
 def panorama(seed=0):
@@ -49,7 +49,7 @@ class FakeModel(WithoutKeyframes):
     explained: float = 0.9
     shift: float = 0.0
     panorama: PanoramaConfig = SIZE
-    error_correlation: ErrorCorrelation = KNOWN
+    error_correlation: ErrorCorrelation = CORRELATION
     rig: Rig = dataclasses.field(default_factory=Rig)
 
     def locate(self, image):
@@ -61,9 +61,13 @@ class FakeModel(WithoutKeyframes):
 @pytest.fixture
 def models(monkeypatch):
     made, load = {'a.npz': FakeModel(), 'b.npz': FakeModel(shift=100.0)}, PlaceModel.load
-    known = staticmethod(lambda path: made.get(str(path)) or load(path))
-    monkeypatch.setattr(PlaceModel, 'load', known)
+    either = staticmethod(lambda path: made.get(str(path)) or load(path))
+    monkeypatch.setattr(PlaceModel, 'load', either)
     return made
+
+
+def declared(**changes):
+    return convert.to_info(dataclasses.replace(SIZE, **changes))
 
 
 def message(seed=1, stamp_ns=5_000_000_001, image=None):
@@ -125,14 +129,26 @@ def test_an_unusable_image_gives_no_pose_and_is_reported(bench, models, kind):
     assert sum(refused.values()) == FROZEN_IMAGES - (kind == 'frozen')
 
 
-def test_panoramas_of_another_size_are_rejected_with_the_remedy(bench, models):
+def test_panoramas_unlike_those_of_training_are_rejected_with_the_remedy(bench, models):
+    """Of another size, or declared to show something else."""
     node = bench.run(SfaNode, model='a.npz')
+    told = bench.listen(DiagnosticArray, '/diagnostics')
+    heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+    refused = node.monitors['panorama'].refused
     bench.publish('panorama', message(image=np.zeros((20, 100, 3), np.uint8)))
-    assert until(lambda: node.monitors['panorama'].refused)
-    (reason,) = node.monitors['panorama'].refused
-    assert '100x20' in reason and '60x12' in reason and 'omnicam_node' in reason
-    heard = bench.listen(PoseStamped, 'sfa/pose')
-    bench.publish('panorama', message())
+    assert until(lambda: len(refused) == 1)
+    bench.publish('panorama/info', declared(clockwise=False), latched_qos())
+    assert until(lambda: node.monitors['panorama/info'].used == 1)
+    bench.publish('panorama', message(seed=1))
+    assert until(lambda: len(refused) == 2)
+    reasons = ' '.join(refused)
+    for words in ('100x20', '60x12', 'clockwise False instead of True', 'omnicam_node'):
+        assert words in reasons
+    assert until(lambda: 'clockwise' in told[-1].status[0].message)
+    assert told[-1].status[0].level == DiagnosticStatus.ERROR and not heard
+    bench.publish('panorama/info', declared(), latched_qos())
+    assert until(lambda: node.monitors['panorama/info'].used == 2)
+    bench.publish('panorama', message(seed=2))
     assert until(lambda: heard)
 
 
@@ -169,51 +185,43 @@ def test_an_estimate_that_is_not_finite_is_never_published(bench, models):
     assert 'no finite estimate' in next(iter(node.monitors['panorama'].refused))
 
 
-def test_the_model_changes_while_running_and_a_bad_one_is_refused(bench, models, tmp_path):
-    """What a model knows of its errors reaches those who come later, too."""
+@pytest.mark.parametrize('state', ['unconfigured', 'inactive', 'active'])
+def test_the_model_changes_in_every_state_and_a_bad_one_is_refused(bench, models, tmp_path, state):
+    """The record of the robot reaches late subscribers, too."""
     models['b.npz'].error_correlation = ErrorCorrelation(0.5, 3.0)
     models['b.npz'].rig = Rig(wheel_scale=Quantity(1.02, 0.01))
-    node = bench.run(SfaNode, model='a.npz')
-    heard = bench.listen(PoseStamped, 'sfa/pose')
-    told = bench.listen(String, 'sfa/rig', latched_qos())
-    assert until(lambda: told) and convert.read_rig(told[0]) == (Rig(), KNOWN)
-    assert node.set_parameters([Parameter('model', value='b.npz')])[0].successful
-    assert until(lambda: len(told) == 2)
-    assert convert.read_rig(told[1]) == (models['b.npz'].rig, ErrorCorrelation(0.5, 3.0))
-    bench.publish('panorama', message(seed=1))
-    assert until(lambda: heard) and heard[0].pose.position.x >= 100
+    node = bench.run(SfaNode, start=state == 'active', model='a.npz')
+    if state == 'inactive':
+        node.trigger_configure()
     (tmp_path / 'damaged.npz').write_bytes(b'PK damaged')
     for path in (tmp_path / 'damaged.npz', 'none.npz', 300 * 'x'):
         refused = node.set_parameters([Parameter('model', value=str(path))])[0]
         assert not refused.successful and str(path) in refused.reason
-    assert node.get_parameter('model').value == 'b.npz'
-    bench.publish('panorama', message(seed=2))
-    assert until(lambda: len(heard) == 2) and heard[1].pose.position.x >= 100
-    models['b.npz'] = FakeModel(shift=500.0)
-    assert bench.call(Trigger, 'sfa_node/reload_model', Trigger.Request()).success
-    bench.publish('panorama', message(seed=3))
-    assert until(lambda: len(heard) == 3) and heard[2].pose.position.x >= 500
-    del models['b.npz']
-    answer = bench.call(Trigger, 'sfa_node/reload_model', Trigger.Request())
-    assert not answer.success and 'b.npz' in answer.message
-
-
-@pytest.mark.parametrize('state', ['unconfigured', 'inactive'])
-def test_a_model_is_checked_in_every_state_and_the_one_reported_is_in_use(bench, models, state):
-    node = bench.run(SfaNode, start=False, model='a.npz')
-    if state != 'unconfigured':
-        node.trigger_configure()
-    refused = node.set_parameters([Parameter('model', value='none.npz')])[0]
-    assert not refused.successful and 'none.npz' in refused.reason
     assert node.get_parameter('model').value == 'a.npz'
     assert node.set_parameters([Parameter('model', value='b.npz')])[0].successful
     if state == 'unconfigured':
         node.trigger_configure()
-    node.trigger_activate()
-    heard = bench.listen(PoseStamped, 'sfa/pose')
+    if state != 'active':
+        node.trigger_activate()
+    heard, rigs = bench.listen(PoseStamped, 'sfa/pose'), []
+    bench.node.create_subscription(String, 'sfa/rig', rigs.append, latched_qos())
+    assert until(lambda: rigs)
+    assert convert.read_rig(rigs[-1]) == (models['b.npz'].rig, ErrorCorrelation(0.5, 3.0))
     bench.publish('panorama', message())
     assert until(lambda: heard) and heard[0].pose.position.x >= 100
     assert node.health()[2]['model'] == 'b.npz'
+
+
+def test_the_model_is_read_again_when_asked(bench, models):
+    bench.run(SfaNode, model='b.npz')
+    heard = bench.listen(PoseStamped, 'sfa/pose')
+    models['b.npz'] = FakeModel(shift=500.0)
+    assert bench.call(Trigger, 'sfa_node/reload_model', Trigger.Request()).success
+    bench.publish('panorama', message())
+    assert until(lambda: heard) and heard[0].pose.position.x >= 500
+    del models['b.npz']
+    answer = bench.call(Trigger, 'sfa_node/reload_model', Trigger.Request())
+    assert not answer.success and 'b.npz' in answer.message
 
 
 def test_a_missing_model_is_named_with_the_remedy(bench, models):
@@ -222,22 +230,3 @@ def test_a_missing_model_is_named_with_the_remedy(bench, models):
         assert not node.start()
         assert why in node.failure and 'train' in node.failure
         bench.end(node)
-
-
-def test_panoramas_declared_to_show_something_else_are_rejected(bench, models):
-    node = bench.run(SfaNode, model='a.npz')
-    told = bench.listen(DiagnosticArray, '/diagnostics')
-    heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
-    other = dataclasses.replace(SIZE, clockwise=False)
-    for count, declared in enumerate((other, SIZE), 1):
-        bench.publish('panorama/info', convert.to_info(declared), latched_qos())
-        assert until(lambda n=count: node.monitors['panorama/info'].used == n)
-        bench.publish('panorama', message(seed=count))
-        if declared is SIZE:
-            break
-        assert until(lambda: node.monitors['panorama'].refused)
-        (reason,) = node.monitors['panorama'].refused
-        assert 'clockwise False instead of True' in reason and 'omnicam' in reason
-        assert until(lambda: told and 'clockwise' in told[-1].status[0].message)
-        assert told[-1].status[0].level == DiagnosticStatus.ERROR and not heard
-    assert until(lambda: heard)
