@@ -302,7 +302,9 @@ def test_simulated_time_that_does_not_come_is_named_and_that_steps_back_starts_a
     assert until(lambda: node.filter.counts['reset'] == 1)
 
 
-def test_the_path_is_thinned_and_bounded(bench, monkeypatch):
+def test_the_path_is_thinned_and_bounded(bench, monkeypatch, capfd):
+    """And without tf2_msgs the node runs, and says so."""
+    monkeypatch.setattr(ekf_node, 'TFMessage', None)
     monkeypatch.setattr(ekf_node, 'PATH_LENGTH', 3)
     node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     heard = bench.listen(Path, 'ekf/path')
@@ -310,18 +312,6 @@ def test_the_path_is_thinned_and_bounded(bench, monkeypatch):
     assert until(lambda: heard and len(heard[-1].poses) == 3)
     stamps = [read_stamp(pose.header.stamp) for pose in heard[-1].poses]
     assert np.all(np.diff(stamps) >= 500_000_000)
-
-
-def test_overrides_of_quality_of_service_are_taken(bench, monkeypatch, capfd):
-    """And without tf2_msgs the node runs, and says so."""
-    monkeypatch.setattr(ekf_node, 'TFMessage', None)
-    bench.run(EkfNode, **{
-        'qos_overrides./odom.subscription.reliability': 'reliable',
-        'qos_overrides./ekf/odometry.publisher.depth': 3,
-    })  # fmt: skip
-    assert until(lambda: bench.node.get_subscriptions_info_by_topic('/odom'))
-    profile = bench.node.get_subscriptions_info_by_topic('/odom')[0].qos_profile
-    assert profile.reliability.name == 'RELIABLE'
     assert 'tf2_msgs is not installed' in capfd.readouterr().err
 
 
@@ -372,24 +362,27 @@ def test_after_an_error_inside_it_starts_anew_and_goes_on(bench, monkeypatch):
     assert any(not state.data.startswith('LOCALISED') for state in states[count:])
 
 
-def test_frames_are_parameters(bench):
-    """The map's always; those of odometry and robot where the messages leave them empty."""
+def test_frames_and_quality_of_service_are_parameters(bench):
+    """The map's frame always; the others where the odometry's messages leave them empty."""
     frames = {'map_frame': 'garden', 'odom_frame': 'wheels', 'base_frame': 'robot'}
-    node = bench.run(EkfNode, initial_pose=AT_ORIGIN, publish_tf=False, **frames)
+    reliable = {'qos_overrides./odom.subscription.reliability': 'reliable'}
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN, publish_tf=False, **frames, **reliable)
     assert bench.node.count_publishers('/tf') == 0, 'others may broadcast the transform'
     fused = bench.listen(Odometry, 'ekf/odometry')
     transforms = bench.listen(TransformStamped, 'ekf/map_to_odom')
+    assert until(lambda: bench.node.get_subscriptions_info_by_topic('/odom'))
+    profile = bench.node.get_subscriptions_info_by_topic('/odom')[0].qos_profile
+    assert profile.reliability.name == 'RELIABLE'
     drive = Drive(seconds=1)
     message = odometry(drive, 0)
     message.header.frame_id = message.child_frame_id = ''
     bench.publish('odom', message)
     assert until(lambda: fused and transforms)
     assert (fused[0].header.frame_id, fused[0].child_frame_id) == ('garden', 'robot')
-    told = transforms[0].header.frame_id, transforms[0].child_frame_id
-    assert told == ('garden', 'wheels')
+    header = transforms[0].header
+    assert (header.frame_id, transforms[0].child_frame_id) == ('garden', 'wheels')
     without_heading = picture(drive, 0, frame='garden')
     without_heading.pose.covariance[35] = 0.0
-    without_heading.pose.pose.orientation.z, without_heading.pose.pose.orientation.w = 1.0, 0.0
     bench.publish(IMAGE_POSE, without_heading)
     assert until(lambda: node.filter.counts['measurement: accepted'] == 1), 'as a position'
 
