@@ -320,7 +320,7 @@ def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
         return entry.DIED if node is not None and node.active else entry.CANNOT_START
     finally:
         if node is not None:
-            node.teardown()
+            node.attempt('cleanup', node.teardown)
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
