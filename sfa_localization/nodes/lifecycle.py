@@ -304,12 +304,14 @@ def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
     logger = rclpy.logging.get_logger(_PACKAGE)
     try:
         _initialize(words)
+        executor = SingleThreadedExecutor()  # after a signal it cannot be made
         node = make()
         parameters.warn_of_arguments(node, words)
         if not node.start():
             return entry.CANNOT_START if rclpy.ok() else 0
+        executor.add_node(node)
         with one_core():
-            _spin(node)
+            _spin(executor, node)
     except LocalizationError as error:
         logger.fatal(str(error))
         return entry.CANNOT_START
@@ -344,13 +346,11 @@ def _initialize(words: list[str]) -> None:
         )
 
 
-def _spin(node: LocalizationNode) -> None:
+def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
     """Spin until a signal.
 
     rclpy raises RuntimeError for a transition that does not fit, ValueError for a negative clock.
     """
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
     while rclpy.ok():
         try:
             executor.spin_once(_WAKE_PERIOD_S)
