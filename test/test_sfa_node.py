@@ -7,14 +7,13 @@ import math
 
 import numpy as np
 import pytest
-from picture_readers import WithoutKeyframes
+from picture_readers import SIZE, PictureReader, panorama
 
-from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.watch import EXPLAINED_WARNING, FROZEN_IMAGES
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.camera_clock import NEAR_NS
-from sfa_localization.localizer import UNKNOWN_VARIANCE, Observation
+from sfa_localization.localizer import UNKNOWN_VARIANCE
 from sfa_localization.place_model import PlaceModel
 
 pytest.importorskip('rclpy')
@@ -27,40 +26,30 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
-from sfa_localization.data.messages import read_stamp, read_yaw
+from sfa_localization.data.messages import read_planar, read_stamp
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.nodes.sfa_node import SfaNode
 
 pytestmark = pytest.mark.ros
-SIZE = PanoramaConfig(width=60, height=12)
-CORRELATION = ErrorCorrelation(0.25, 1.5)
-
-
-def panorama(seed=0):
-    noise = np.random.default_rng(seed).normal(120, 40, (SIZE.height, SIZE.width, 3))
-    return np.clip(noise, 0, 255).astype(np.uint8)
+PLACE, CORRELATION = (3.0, 4.0, 0.25), ErrorCorrelation(0.25, 1.5)
 
 
 @dataclasses.dataclass
-class FakeModel(WithoutKeyframes):
-    """Says that the position is the first pixel's blue and green; `explained` is a thing to set."""
+class ShiftedReader(PictureReader):
+    """Reads poses off pictures, and shifts them by `shift` m."""
 
-    explained: float = 0.9
     shift: float = 0.0
-    panorama: PanoramaConfig = SIZE
     error_correlation: ErrorCorrelation = CORRELATION
-    rig: Rig = dataclasses.field(default_factory=Rig)
 
     def locate(self, image):
-        pose = np.append(image[0, 0, :2] + self.shift, 0.25)
-        spread = np.diag([0.04, 0.09, 0.01])
-        return Observation(pose, spread, np.arange(1.0, 9.0), self.explained)
+        seen = super().locate(image)
+        return dataclasses.replace(seen, pose=seen.pose + np.array([self.shift, 0, 0]))
 
 
 @pytest.fixture
 def models(monkeypatch):
-    made, load = {'a.npz': FakeModel(), 'b.npz': FakeModel(shift=100.0)}, PlaceModel.load
+    made, load = {'a.npz': ShiftedReader(), 'b.npz': ShiftedReader(shift=100.0)}, PlaceModel.load
     either = staticmethod(lambda path: made.get(str(path)) or load(path))
     monkeypatch.setattr(PlaceModel, 'load', either)
     return made
@@ -70,8 +59,9 @@ def declared(**changes):
     return convert.to_info(dataclasses.replace(SIZE, **changes))
 
 
-def message(seed=1, stamp_ns=5_000_000_001, image=None):
-    return convert.to_image(panorama(seed) if image is None else image, stamp_ns, 'omnicam')
+def message(seed=1, stamp_ns=5_000_000_001, explained=0.9, image=None):
+    image = panorama(PLACE, seed, explained) if image is None else image
+    return convert.to_image(image, stamp_ns, 'omnicam')
 
 
 def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, models):
@@ -83,20 +73,18 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
     poses = bench.listen(PoseStamped, 'sfa/pose')
     uncertain = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
     turned = bench.listen(QuaternionStamped, 'sfa/turned')
-    sent = panorama(1)
-    bench.publish('panorama', message(image=sent))
+    bench.publish('panorama', message())
     assert until(lambda: slow and features and poses and uncertain)
-    assert list(slow[0].data) == list(range(1, 9))
+    assert list(slow[0].data) == pytest.approx(PLACE, abs=1e-3), 'as the reader says'
     p = features[0].pose.position
-    assert (p.x, p.y, p.z) == (1, 2, 3) and features[0].header.frame_id == 'slow_feature_space'
+    assert (p.x, p.y, p.z) == tuple(slow[0].data)
+    assert features[0].header.frame_id == 'slow_feature_space'
     for pose, stamped in ((poses[0].pose, poses[0]), (uncertain[0].pose.pose, uncertain[0])):
         assert read_stamp(stamped.header.stamp) == 5_000_000_001
         assert stamped.header.frame_id == 'garden'
-        assert (pose.position.x, pose.position.y) == (sent[0, 0, 0], sent[0, 0, 1])
-        assert read_yaw(pose.orientation) == pytest.approx(0.25)
-    assert np.allclose(convert.read_pose(uncertain[0])[2], np.diag([0.04, 0.09, 0.01]))
-    models['a.npz'].explained = EXPLAINED_WARNING - 0.05
-    bench.publish('panorama', message(seed=2))
+        assert read_planar(pose.position, pose.orientation) == pytest.approx(PLACE, abs=1e-3)
+    assert np.allclose(convert.read_pose(uncertain[0])[2], np.diag([0.02, 0.03, 0.002]))
+    bench.publish('panorama', message(seed=2, explained=EXPLAINED_WARNING - 0.05))
     assert until(lambda: 'unlike' in node.health()[1])
     told_of = node.health()[2]
     assert told_of['explained'] == '35 %', 'of the last image'
@@ -107,22 +95,23 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
     assert until(lambda: 'no image on /panorama for' in told[-1].status[0].message)
 
 
-@pytest.mark.parametrize('kind', ['dark', 'frozen', 'foreign'])
+@pytest.mark.parametrize('kind', ['dark', 'frozen', 'foreign', 'not finite'])
 def test_an_unusable_image_gives_no_pose_and_is_reported(bench, models, kind):
     node = bench.run(SfaNode, model='a.npz')
     poses = bench.listen(PoseStamped, 'sfa/pose')
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
     said = bench.listen(DiagnosticArray, '/diagnostics')
-    models['a.npz'].explained = 0.1 if kind == 'foreign' else 0.9
-    image = panorama(5) if kind != 'dark' else np.zeros((SIZE.height, SIZE.width, 3), np.uint8)
+    models['a.npz'].shift = math.nan if kind == 'not finite' else 0.0
+    image = panorama(PLACE, 5, explained=0.1 if kind == 'foreign' else 0.9)
+    image = np.zeros_like(image) if kind == 'dark' else image
     for k in range(FROZEN_IMAGES):
         bench.publish('panorama', message(image=image, stamp_ns=100 + k))
         assert until(lambda n=k: len(heard) == n + 1)
-    covariance = np.reshape(heard[-1].pose.covariance, (6, 6))
-    assert covariance[0, 0] == covariance[1, 1] == UNKNOWN_VARIANCE
+    _, pose, covariance = convert.read_pose(heard[-1])
+    assert covariance[0, 0] == covariance[1, 1] == UNKNOWN_VARIANCE and np.isfinite(pose).all()
     assert len(poses) == (1 if kind == 'frozen' else 0)
     assert until(lambda: said and said[-1].status[0].level != b'\x00')
-    models['a.npz'].explained = 0.9
+    models['a.npz'].shift = 0.0
     bench.publish('panorama', message(seed=77, stamp_ns=200))
     assert until(lambda: poses and read_stamp(poses[-1].header.stamp) == 200)
     refused = node.monitors['panorama'].refused
@@ -142,7 +131,12 @@ def test_panoramas_unlike_those_of_training_are_rejected_with_the_remedy(bench, 
     bench.publish('panorama', message(seed=1))
     assert until(lambda: len(refused) == 2)
     reasons = ' '.join(refused)
-    for words in ('100x20', '60x12', 'clockwise False instead of True', 'omnicam_node'):
+    for words in (
+        '100x20',
+        f'{SIZE.width}x{SIZE.height}',
+        'clockwise False instead of True',
+        'omnicam_node',
+    ):
         assert words in reasons
     assert until(lambda: 'clockwise' in told[-1].status[0].message)
     assert told[-1].status[0].level == DiagnosticStatus.ERROR and not heard
@@ -155,15 +149,14 @@ def test_panoramas_unlike_those_of_training_are_rejected_with_the_remedy(bench, 
 @pytest.mark.parametrize('transport', ['raw', 'compressed'])
 def test_malformed_images_are_counted_and_end_nothing(bench, models, transport):
     """What is wrong with images is tested in test_pictures.py."""
-    stampless, cut = message(), message()
-    stampless.header.stamp.sec = stampless.header.stamp.nanosec = 0
+    stampless, cut = message(stamp_ns=0), message()
     cut.data = bytes(5)
     compressed = CompressedImage(format='jpeg', data=b'no picture')
     compressed.header.stamp.sec = 1
     topic, bad, good = 'panorama', [Image(), stampless, cut], message()
     if transport == 'compressed':
         topic, bad = 'panorama/compressed', [CompressedImage(), compressed]
-        good = convert.to_compressed(panorama(), 7, 'omnicam', 90)
+        good = convert.to_compressed(panorama(PLACE), 7, 'omnicam', 90)
     node = bench.run(SfaNode, model='a.npz', image_transport=transport)
     heard, refused = bench.listen(PoseStamped, 'sfa/pose'), node.monitors[topic].refused
     for count, broken in enumerate(bad, 1):
@@ -172,17 +165,6 @@ def test_malformed_images_are_counted_and_end_nothing(bench, models, transport):
     assert not heard and not [why for why in refused if 'internal' in why]
     bench.publish(topic, good)
     assert until(lambda: heard)
-
-
-def test_an_estimate_that_is_not_finite_is_never_published(bench, models):
-    node = bench.run(SfaNode, model='a.npz')
-    models['a.npz'].shift = math.nan
-    heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
-    bench.publish('panorama', message())
-    assert until(lambda: node.monitors['panorama'].refused and heard)
-    _, pose, covariance = convert.read_pose(heard[0])
-    assert np.array_equal(pose, np.zeros(3)) and covariance[0, 0] == UNKNOWN_VARIANCE
-    assert 'no finite estimate' in next(iter(node.monitors['panorama'].refused))
 
 
 @pytest.mark.parametrize('state', ['unconfigured', 'inactive', 'active'])
@@ -215,7 +197,7 @@ def test_the_model_changes_in_every_state_and_a_bad_one_is_refused(bench, models
 def test_the_model_is_read_again_when_asked(bench, models):
     bench.run(SfaNode, model='b.npz')
     heard = bench.listen(PoseStamped, 'sfa/pose')
-    models['b.npz'] = FakeModel(shift=500.0)
+    models['b.npz'] = ShiftedReader(shift=500.0)
     assert bench.call(Trigger, 'sfa_node/reload_model', Trigger.Request()).success
     bench.publish('panorama', message())
     assert until(lambda: heard) and heard[0].pose.position.x >= 500
