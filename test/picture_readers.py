@@ -44,8 +44,14 @@ def fit_at(place, explained, **more):
     return Fit(np.asarray(place), np.ones(1), np.zeros(3), residual=np.zeros((1, 1)), **numbers)
 
 
-class WithoutKeyframes:
-    """A stand-in for a model that has only `locate`."""
+@dataclasses.dataclass
+class PictureReader:
+    """Reads what `panorama` wrote; positions are positive."""
+
+    panorama: PanoramaConfig = SIZE
+    heading: bool = True
+    error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
+    rig: Rig = dataclasses.field(default_factory=Rig)
 
     def views(self, images):
         return images
@@ -57,16 +63,6 @@ class WithoutKeyframes:
 
     def observed(self, view, location):
         return self.locate(view)
-
-
-@dataclasses.dataclass
-class PictureReader(WithoutKeyframes):
-    """Reads what `panorama` wrote; positions are positive."""
-
-    panorama: PanoramaConfig = SIZE
-    heading: bool = True
-    error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
-    rig: Rig = dataclasses.field(default_factory=Rig)
 
     def locate(self, image):
         a, b, explained = image[0, :3].astype(int)

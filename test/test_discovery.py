@@ -41,11 +41,10 @@ def takes_another(node, topic):
     return node.full_name(topic) != node.resolve_topic_name(topic)
 
 
-def test_odometry_of_another_name_is_found(bench):
-    """And images."""
+def test_inputs_of_another_name_are_taken(bench):
     node = bench.run(EkfNode)
-    zero, one, frames = np.zeros(3), np.eye(3), ('odom', 'base_link')
-    message = to_odometry(zero, one, zero[:2], one[:2, :2], STAMP_NS, frames)
+    zero, unit, frames = np.zeros(3), np.eye(3), ('odom', 'base_link')
+    message = to_odometry(zero, unit, zero[:2], unit[:2, :2], STAMP_NS, frames)
     used = node.monitors['odom']
     assert bench.publish_until('/wheel_odometry', message, lambda: used.received)
     assert node.full_name('odom') == '/wheel_odometry', 'diagnostics name the topic that is used'
@@ -59,8 +58,8 @@ def test_odometry_of_another_name_is_found(bench):
 
 
 @pytest.mark.parametrize(('others', 'arguments'), [
-    (['/one', '/two'], []), (['/one', '/odom'], []),
-    (['/one'], ['--ros-args', '-r', 'odom:=/mine']),
+    (['/a', '/b'], []), (['/a', '/odom'], []),
+    (['/a'], ['--ros-args', '-r', 'odom:=/mine']),
     (['/robot2/wheels'], ['--ros-args', '-r', '__ns:=/robot1']),
 ])  # fmt: skip
 def test_where_there_is_a_choice_it_is_not_made(bench, others, arguments):
@@ -76,33 +75,29 @@ def test_where_there_is_a_choice_it_is_not_made(bench, others, arguments):
 
 
 IMAGES = 'image:=NAME or panorama:=NAME'
+OTHER_NAME = ['--ros-args', '-r', 'ekf/odometry:=/fused', '-r', '__ns:=/robot1']
 
 
-@pytest.mark.parametrize(('kind', 'robot', 'there', 'arguments'), [
+@pytest.mark.parametrize(('kind', 'other', 'topics', 'arguments'), [
     # The driver is in the namespace, or its topic alone, because a bridge has none.
-    (EkfNode, '/robot1', ['/robot1/ekf/odometry', '/robot1/wheels'], 'odom:=NAME'),
-    (OmnicamNode, '/robot1', ['/robot1/panorama'], IMAGES),
+    (EkfNode, {'namespace': '/robot1'}, ['/robot1/ekf/odometry', '/robot1/wheels'], 'odom:=NAME'),
+    (EkfNode, {'cli_args': OTHER_NAME}, ['/fused'], 'odom:=NAME'),
+    (OmnicamNode, {'namespace': '/robot1'}, ['/robot1/panorama'], IMAGES),
     # Played from a bag of another namespace.
-    (OmnicamNode, '', ['/robot1/panorama'], IMAGES),
+    (OmnicamNode, None, ['/robot1/panorama'], IMAGES),
 ])  # fmt: skip
-def test_the_output_of_another_localizer_is_no_sensor(bench, kind, robot, there, arguments):
-    if robot:
-        bench.run(kind, options={'namespace': robot})
+def test_the_output_of_another_localizer_is_no_sensor(bench, kind, other, topics, arguments):
+    if other:
+        bench.run(kind, options=other)
     node = bench.run(kind)
     message, topic = (Odometry, 'odom') if kind is EkfNode else (Image, 'image_raw')
-    announce(bench, node, message, *there)
-    node.discovery.look()
+    if topics == ['/fused']:
+        assert until(lambda: node.count_publishers('/fused'))
+    else:
+        announce(bench, node, message, *topics)
     assert not takes_another(node, topic)
     hint = node.discovery.hint
-    assert all(name in hint for name in there) and hint.endswith(f': {arguments}')
-
-
-def test_an_output_of_this_package_under_another_name_is_no_sensor(bench):
-    bench.run(EkfNode, options={'cli_args': ['--ros-args', '-r', 'ekf/odometry:=/fused',
-                                             '-r', '__ns:=/robot1']})  # fmt: skip
-    node = bench.run(EkfNode)
-    assert until(lambda: node.count_publishers('/fused'))
-    assert not takes_another(node, 'odom') and '/fused' in node.discovery.hint
+    assert all(name in hint for name in topics) and hint.endswith(f': {arguments}')
 
 
 @pytest.mark.parametrize(('kind', 'settings'), [

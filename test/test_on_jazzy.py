@@ -180,16 +180,16 @@ def test_a_lookup_of_tf2_during_bag_play_is_ekf_odometry(bench, start):
     corrector = Corrector(bench)
     played(start, DRIVE, '--topics', '/odom', '--rate', '2')
     assert until(lambda: len(corrector.fused) > 700), 'ekf_node did not follow the bag'
-    found, missed = [], []
+    map_to_odom, errors = [], []
     for stamp_ns, fused in sorted(corrector.fused.items())[:-1]:
         t = buffer.lookup_transform('map', 'odom', Time(nanoseconds=stamp_ns)).transform
-        found.append([t.translation.x, t.translation.y, read_yaw(t.rotation)])
+        map_to_odom.append([t.translation.x, t.translation.y, read_yaw(t.rotation)])
         if stamp_ns in corrector.odometry:
-            missed.append(compose(found[-1], corrector.odometry[stamp_ns]) - fused)
-    assert len(missed) > 600
-    assert np.hypot(*np.array(missed).T[:2]).max() < 1e-3
-    assert max(abs(math.remainder(miss[2], 2 * math.pi)) for miss in missed) < 1e-3
-    assert np.ptp(found, axis=0)[0] > 0.05, 'nothing was corrected'
+            errors.append(compose(map_to_odom[-1], corrector.odometry[stamp_ns]) - fused)
+    assert len(errors) > 600
+    assert np.hypot(*np.array(errors).T[:2]).max() < 1e-3
+    assert max(abs(math.remainder(error[2], 2 * math.pi)) for error in errors) < 1e-3
+    assert np.ptp(map_to_odom, axis=0)[0] > 0.05, 'nothing was corrected'
 
 
 def test_the_launched_chain_follows_a_bag_in_a_namespace(bench, start, model):

@@ -1,30 +1,50 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Every parameter changes something.
+"""Parameters: each changes something; their file reads back to the same settings, strictly.
 
-Those of the filter are set to another value than their default, one by one, along a drive that is
-rich enough: a new one needs no entry here. Other tests set the others.
+Those of the filter are set to another value than their default, one by one, along a rich drive: a
+new one needs no entry here. Other tests set the others.
 """
 
 import dataclasses
+import os
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from filter_drives import START_NS, FilterDrive
+from ros_domains import free_domain
 
-from sfa_localization.config import SECTIONS
-from sfa_localization.data.errors import ConfigError
+from sfa_localization import config as config_file
+from sfa_localization.camera.calibration_files import read_calibration
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.cli import main
+from sfa_localization.config import (
+    SECTIONS,
+    given_names,
+    ignored_sections,
+    load_settings,
+    render,
+    write_config,
+)
+from sfa_localization.data import plain_yaml
+from sfa_localization.data.errors import CameraError, ConfigError
+from sfa_localization.data.plain_yaml import load_yaml
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.nodes.settings import EkfNodeConfig
 
+DOMAIN = free_domain()
+SHIPPED = Path(__file__).parents[1] / 'config' / 'localization.yaml'
+EVERY = [(section, kind) for section, kinds in SECTIONS.items() for kind in kinds]
 
-def believed(settings: FilterConfig) -> str:
-    """What a filter believes along a drive with everything that may happen to one."""
+
+def believed(settings: FilterConfig):
+    """Yield what a filter believes along a drive with everything that may happen to one."""
     fused, weak = PoseFilter(settings), PoseFilter(settings)
-    seen = [weak.add_measurement(START_NS, np.zeros(3), np.diag([9.0, 9.0, 0.1])).reason]
+    yield weak.add_measurement(START_NS, np.zeros(3), np.diag([9.0, 9.0, 0.1])).reason
     rng = np.random.default_rng(1)
     moving = [(1.0, 0.5 * np.sin(0.05 * i)) for i in range(1200)]
     twists = np.array(moving[:300] + [(5e-4, 1e-3)] * 40 + moving[300:])
@@ -32,8 +52,7 @@ def believed(settings: FilterConfig) -> str:
                  yaw_std=0.1, bias=0.01, scale=0.98)  # fmt: skip
     trip.read[300:320], trip.read[320:340] = (1.5e-3, 1e-3), (5e-4, 3e-3)
     trip.kidnap(200, (2.5, 1.5, 0.0))
-    for event in trip.events():
-        stamp, kind, index = event
+    for stamp, kind, index in trip.events():
         t = (stamp - START_NS) * 1e-9
         if kind == 0:
             if 20 < t < 26 or 40 < t < 40.8:
@@ -54,11 +73,9 @@ def believed(settings: FilterConfig) -> str:
             value[:2] += (rng.random() < 0.1) * 3.0
             late = stamp - 6 * 10**9 if index % 40 == 39 else stamp
             update = fused.add_measurement(late, value, spread)
-            seen.append((update.d2, update.reason))
+            yield repr((update.d2, update.reason))
         state = fused.at(stamp)
-        seen.append((fused.status, None if state is None else
-                     (state.pose.tolist(), state.covariance.tolist())))  # fmt: skip
-    return repr(seen)
+        yield repr((fused.status, state and (state.pose.tolist(), state.covariance.tolist())))
 
 
 SPECIAL = {
@@ -81,13 +98,14 @@ def another(item):
 def test_every_parameter_of_the_filter_changes_something():
     """And without another value nothing differs, else any would seem to change something."""
     placed = {'initial_pose': (0.0, 0.0, 0.0)}
-    plain, started = believed(FilterConfig()), believed(FilterConfig(**placed))
-    assert believed(FilterConfig()) == plain != started
+    plain, started = [*believed(FilterConfig())], [*believed(FilterConfig(**placed))]
+    assert [*believed(FilterConfig())] == plain
     without_effect = []
     for item in dataclasses.fields(FilterConfig):
         at_start = item.name in ('initial_position_std', 'initial_yaw_std')
-        given = {**(placed if at_start else {}), item.name: another(item)}
-        if believed(FilterConfig(**given)) == (started if at_start else plain):
+        settings = FilterConfig(**{**(placed if at_start else {}), item.name: another(item)})
+        pairs = zip(believed(settings), started if at_start else plain, strict=True)
+        if all(changed == usual for changed, usual in pairs):
             without_effect.append(item.name)
     assert without_effect == []
 
@@ -101,7 +119,189 @@ def test_every_parameter_is_set_in_some_test():
     assert names - words == set(), 'nothing shows that these do anything'
 
 
-def test_frames_that_are_one_are_rejected():
+def test_equal_frames_are_rejected():
     for given in ({'odom_frame': 'map'}, {'map_frame': 'base_link'}):
         with pytest.raises(ConfigError, match='three different frames'):
             EkfNodeConfig.from_mapping(given, 'parameters')
+
+
+# The file.
+
+
+def saved(tmp_path, text):
+    path = tmp_path / 'c.yaml'
+    path.write_text(text)
+    return path
+
+
+def key(section):
+    return section if section == 'training' else f'/**/{section}'
+
+
+def test_the_shipped_file_is_what_the_settings_say_and_reads_back_to_them():
+    remedy = 'python -m sfa_localization config > config/localization.yaml'
+    assert SHIPPED.read_text() == render(), f'regenerate it: {remedy}'
+    assert [k for section, k in EVERY if load_settings(SHIPPED, section, k) != k()] == []
+
+
+def test_every_parameter_is_explained_and_has_the_type_that_ros_needs():
+    text = render()
+    lines, document = text.splitlines(), yaml.safe_load(text)
+    assert '# columns of the panorama [px]; 16..8192\n    width: 600\n' in text
+    for section, kinds in SECTIONS.items():
+        items = [item for kind in kinds for item in dataclasses.fields(kind)]
+        assert len({item.name for item in items}) == len(items), 'names do not clash'
+        values = document[key(section)]['ros__parameters']
+        for item in items:
+            places = [i for i, line in enumerate(lines) if line.startswith(f'    {item.name}: ')]
+            assert places and all(lines[i - 1].startswith('    # ') for i in places), item.name
+            default = list(item.default) if isinstance(item.default, tuple) else item.default
+            assert type(values[item.name]) is type(default), item.name
+
+
+def test_parameters_of_ros_are_kept(tmp_path):
+    """A file that is read and written again keeps the parameters of ROS, and all others."""
+    path = saved(
+        tmp_path,
+        """
+/**: {ros__parameters: {use_sim_time: true, width: 300}}
+ekf_node:
+  ros__parameters:
+    lost_std: 3
+    slip_per_metre: 1e-3
+    qos_overrides: {/odom: {subscription: {depth: 3}}}
+omnicam_node: {ros__parameters: {qos_overrides./panorama.publisher.depth: 7}}
+training: {ros__parameters: {slow_features: 7}}
+""",
+    )
+    assert load_settings(path, 'omnicam_node', PanoramaConfig) == PanoramaConfig(width=300)
+    settings = load_settings(path, 'ekf_node', FilterConfig)
+    assert settings == FilterConfig(lost_std=3.0, slip_per_metre=1e-3), 'whole numbers, no points'
+    changes = config_file.load_changes(path)
+    write_config(tmp_path / 'new.yaml', changes)
+    sections = yaml.safe_load((tmp_path / 'new.yaml').read_text())
+    ekf, omnicam, sfa, training = (
+        sections[key(name)]['ros__parameters']
+        for name in ('ekf_node', 'omnicam_node', 'sfa_node', 'training')
+    )
+    assert ekf['use_sim_time'] is omnicam['use_sim_time'] is sfa['use_sim_time'] is True
+    assert ekf['qos_overrides'] == {'/odom': {'subscription': {'depth': 3}}}
+    assert omnicam['qos_overrides./panorama.publisher.depth'] == 7
+    assert (ekf['slip_per_metre'], type(ekf['lost_std'])) == (1e-3, float), 'as ROS reads them'
+    assert (omnicam['width'], training['slow_features']) == (300, 7)
+    assert config_file.load_changes(tmp_path / 'new.yaml')['ekf_node'].items() >= ekf.items()
+
+
+VALUES = '{ros__parameters: {lost_std: 3.0}}'
+SPELLINGS = {
+    f'ekf_node: {VALUES}': ['/ekf_node'],
+    f'/ekf_node: {VALUES}': ['/ekf_node'],
+    f'/**/ekf_node: {VALUES}': ['/ekf_node', '/robot1/ekf_node', '/a/robot1/ekf_node'],
+    f'/*/ekf_node: {VALUES}': ['/robot1/ekf_node'],
+    f'/robot1/ekf_node: {VALUES}': ['/robot1/ekf_node'],
+    f'robot1: {{ekf_node: {VALUES}}}': ['/robot1/ekf_node'],
+    f'/a: {{robot1: {{ekf_node: {VALUES}}}}}': ['/a/robot1/ekf_node'],
+    f'/**: {{ekf_node: {VALUES}}}': ['/ekf_node', '/robot1/ekf_node', '/a/robot1/ekf_node'],
+    f'/**: {VALUES}': ['/ekf_node', '/robot1/ekf_node', '/a/robot1/ekf_node'],
+}
+"""A section, and which of these nodes ROS gives it to."""
+
+
+def test_commands_and_ros_agree_on_which_nodes_a_section_is_for(tmp_path):
+    """Commands read a section of any namespace, and know which nodes ROS gives it to."""
+    rclpy = pytest.importorskip('rclpy')
+    for text, nodes in SPELLINGS.items():
+        path = saved(tmp_path, text)
+        assert load_settings(path, 'ekf_node', FilterConfig).lost_std == 3.0
+        assert ignored_sections(path, '/robot2/sfa_node') == []
+        context, taken = rclpy.Context(), []
+        arguments = ['--ros-args', '--params-file', str(path)]
+        rclpy.init(context=context, domain_id=DOMAIN, args=arguments)
+        for namespace in ('', '/robot1', '/a/robot1'):
+            node = rclpy.create_node(
+                'ekf_node', namespace=namespace, context=context,
+                automatically_declare_parameters_from_overrides=True,
+            )  # fmt: skip
+            if node.has_parameter('lost_std'):
+                taken.append(node.get_fully_qualified_name())
+            node.destroy_node()
+            is_given = f'{namespace}/ekf_node' in nodes
+            assert bool(given_names(path, f'{namespace}/ekf_node')) == is_given
+            assert bool(ignored_sections(path, f'{namespace}/ekf_node')) != is_given
+        rclpy.try_shutdown(context=context)
+        assert taken == nodes, text
+
+
+def test_the_section_of_a_robot_comes_before_that_of_all_robots(tmp_path):
+    path = saved(tmp_path, f'/robot1/ekf_node: {VALUES}\n'
+                           '/**/ekf_node: {ros__parameters: {lost_std: 4.0, speed_std: 0.5}}\n'
+                           '/robot2/ekf_node: {ros__parameters: {rate_std: 0.5}}\n')  # fmt: skip
+    settings = load_settings(path, 'ekf_node', FilterConfig)
+    assert (settings.lost_std, settings.speed_std, settings.rate_std) == (3.0, 0.5, 0.5)
+
+
+INVALID = [
+    ('ekf_node: [1', 'is not YAML'), ('a: 1\n---\nb: 1', 'is not YAML'),
+    ('- 1\n', 'must hold sections'), ('3\n', 'must hold sections'),
+    ('efk_node: {}\n', "unknown section 'efk_node'"),
+    ('ekf_node: {lost_std: 3}\n', 'ros__parameters'),
+    ('ekf_node: {ros__parameters: 3}\n', 'names and values'),
+    ('ekf_node: {ros__parameters: {lost_sdt: 3}}\n', "did you mean 'lost_std'"),
+    ('ekf_node: {ros__parameters: {lost_std: x}}\n', 'lost_std'),
+    ('ekf_node: {ros__parameters: {lost_std: -1}}\n', 'outside'),
+    ('ekf_node: {ros__parameters: {lost_std: .nan}}\n', 'finite'),
+    ('ekf_node: {ros__parameters: {width: 300}}\n', "unknown parameter 'width'"),
+    ('/**: {ros__parameters: {nonsense: 1}}\n', "unknown parameter 'nonsense'"),
+    ('/**/efk_node: {ros__parameters: {lost_std: 3}}\n', "unknown section '/\\*\\*/efk_node'"),
+    ('robot1: {ekf_node: {lost_std: 3}}\n', "'robot1/ekf_node' must hold 'ros__parameters'"),
+    ('robot1: {ekf_node: {ros__parameters: {lost_std: 3}}}\n'
+     '/robot2/ekf_node: {ros__parameters: {lost_std: 4}}\n', 'a file of one robot'),
+]  # fmt: skip
+
+
+# Text that is no parameter file, and no other YAML of a user.
+REJECTED = {
+    'a: 2001-99-99': 'has a date or a number that cannot be: month must',
+    'a: ' + '[' * 40 + ']' * 40: 'nested deeper than 32',
+    'a: 1\nb: 2\na: 3': "the key 'a' twice",
+    'a: !!python/object/apply:os.system [x]': 'could not determine a constructor',
+    'a: [': 'not YAML',
+}
+
+
+@pytest.mark.parametrize('loader', dict.fromkeys((plain_yaml.YamlLoader, yaml.SafeLoader)))
+def test_an_invalid_file_is_rejected_with_its_name_and_the_reason(loader, tmp_path, monkeypatch):
+    """With libyaml and without, as a parameter file and as a calibration."""
+    monkeypatch.setattr(plain_yaml, 'YamlLoader', loader)
+    for text, why in [*INVALID, *REJECTED.items()]:
+        path = saved(tmp_path, text)
+        with pytest.raises(ConfigError, match=why) as raised:
+            load_settings(path, 'ekf_node', FilterConfig)
+        assert str(path) in str(raised.value) and '\n' not in str(raised.value), text
+        if text in REJECTED:
+            with pytest.raises(CameraError, match=why):
+                read_calibration(path)
+    long = saved(tmp_path, f'ekf_node: {{ros__parameters: {{lost_std: [{"1, " * 10**3}]}}}}')
+    with pytest.raises(ConfigError, match='lost_std') as raised:
+        load_settings(long, 'ekf_node', FilterConfig)
+    assert len(str(raised.value)) < 600
+    shared = 'a: &x {k: 1}\nb: *x\nc: {<<: *x, <<: {m: 2}}\n'
+    assert load_yaml(shared)['c'] == {'k': 1, 'm': 2} and load_yaml('') is None
+
+
+def test_the_command_prints_and_writes_and_others_name_a_file_that_cannot_be_read(tmp_path, capsys):
+    """A pipe would be waited for."""
+    assert main(['config']) == 0
+    assert capsys.readouterr().out == render()
+    assert main(['config', '--output', str(tmp_path / 'c.yaml')]) == 0
+    assert (tmp_path / 'c.yaml').read_text() == render()
+    os.mkfifo(tmp_path / 'pipe')
+    (tmp_path / 'bad.yaml').write_text('a: [')
+    for name, why in {
+        'pipe': 'cannot be read: it is no regular file', 'none.yaml': 'cannot be read: No such',
+        'bad.yaml': 'is not YAML',
+    }.items():  # fmt: skip
+        words = ['train', 'no_bag', '--output', str(tmp_path / 'a.npz')]
+        assert main([*words, '--config', str(tmp_path / name)]) == 1
+        error = capsys.readouterr().err
+        assert error.startswith(f'error: {tmp_path / name}: {why}') and error.count('\n') == 1

@@ -41,8 +41,8 @@ def children():
 
 
 @pytest.fixture(autouse=True)
-def nothing_is_left(monkeypatch):
-    """No process is left after a test; timeouts are short, and the environment is restored."""
+def no_process_remains(monkeypatch):
+    """No process remains after a test; timeouts are short, and the environment is restored."""
     for name, seconds in {'SETTLE_S': 0.3, 'STOP_S': 5.0}.items():
         monkeypatch.setattr(live_nodes, name, seconds)
     with mock.patch.dict(os.environ):
@@ -79,9 +79,9 @@ def test_a_dead_program_is_named_with_its_last_words(tmp_path):
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_nothing_is_left_when_the_command_is_told_to_end(tmp_path, number):
+def test_no_process_remains_when_the_command_is_told_to_end(tmp_path, number):
     code = f"""
-import sys, time
+import time
 from pathlib import Path
 from sfa_localization import cli
 from sfa_localization.commands import config
@@ -89,14 +89,14 @@ from sfa_localization.commands.live_nodes import Processes
 
 def run(arguments):
     with Processes(Path({str(tmp_path)!r}), 5.0) as processes:
-        processes.start('node', [{sys.executable!r}, '-c', {WAIT!r}])
+        processes.start('node', {python(WAIT)!r})
         while 'ready' not in processes.log('node').read_text():
             time.sleep(0.01)
         print('started', flush=True)
         time.sleep(60)
 
 config.run = run
-sys.exit(cli.main(['config']))
+raise SystemExit(cli.main(['config']))
 """
     starter = subprocess.Popen(
         python(code), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -118,7 +118,7 @@ role, behavior = sys.argv[1:3]
 if behavior == 'fail':
     sys.exit('stand-in: no model, no bag')
 if role == 'play':
-    time.sleep(4.0)
+    time.sleep(2.0)
     sys.exit(0)
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped as Pose

@@ -7,14 +7,13 @@ import math
 
 import numpy as np
 import pytest
-from picture_readers import WithoutKeyframes
+from picture_readers import SIZE, PictureReader, panorama
 
-from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.watch import EXPLAINED_WARNING, FROZEN_IMAGES
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.camera_clock import NEAR_NS
-from sfa_localization.localizer import UNKNOWN_VARIANCE, Observation
+from sfa_localization.localizer import UNKNOWN_VARIANCE
 from sfa_localization.place_model import PlaceModel
 
 pytest.importorskip('rclpy')
@@ -27,47 +26,42 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
-from sfa_localization.data.messages import read_stamp, read_yaw
+from sfa_localization.data.messages import read_planar, read_stamp
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.nodes.sfa_node import SfaNode
 
 pytestmark = pytest.mark.ros
-SIZE = PanoramaConfig(width=60, height=12)
-KNOWN = ErrorCorrelation(0.25, 1.5)
-
-
-def panorama(seed=0):
-    noise = np.random.default_rng(seed).normal(120, 40, (SIZE.height, SIZE.width, 3))
-    return np.clip(noise, 0, 255).astype(np.uint8)
+PLACE, CORRELATION = (3.0, 4.0, 0.25), ErrorCorrelation(0.25, 1.5)
 
 
 @dataclasses.dataclass
-class FakeModel(WithoutKeyframes):
-    """Says that the position is the first pixel's blue and green; `explained` is a thing to set."""
+class ShiftedReader(PictureReader):
+    """Reads poses off pictures, and shifts them by `shift` m."""
 
-    explained: float = 0.9
     shift: float = 0.0
-    panorama: PanoramaConfig = SIZE
-    error_correlation: ErrorCorrelation = KNOWN
-    rig: Rig = dataclasses.field(default_factory=Rig)
+    error_correlation: ErrorCorrelation = CORRELATION
 
     def locate(self, image):
-        pose = np.append(image[0, 0, :2] + self.shift, 0.25)
-        spread = np.diag([0.04, 0.09, 0.01])
-        return Observation(pose, spread, np.arange(1.0, 9.0), self.explained)
+        seen = super().locate(image)
+        return dataclasses.replace(seen, pose=seen.pose + np.array([self.shift, 0, 0]))
 
 
 @pytest.fixture
 def models(monkeypatch):
-    made, load = {'a.npz': FakeModel(), 'b.npz': FakeModel(shift=100.0)}, PlaceModel.load
-    known = staticmethod(lambda path: made.get(str(path)) or load(path))
-    monkeypatch.setattr(PlaceModel, 'load', known)
+    made, load = {'a.npz': ShiftedReader(), 'b.npz': ShiftedReader(shift=100.0)}, PlaceModel.load
+    either = staticmethod(lambda path: made.get(str(path)) or load(path))
+    monkeypatch.setattr(PlaceModel, 'load', either)
     return made
 
 
-def message(seed=1, stamp_ns=5_000_000_001, image=None):
-    return convert.to_image(panorama(seed) if image is None else image, stamp_ns, 'omnicam')
+def declared(**changes):
+    return convert.to_info(dataclasses.replace(SIZE, **changes))
+
+
+def message(seed=1, stamp_ns=5_000_000_001, explained=0.9, image=None):
+    image = panorama(PLACE, seed, explained) if image is None else image
+    return convert.to_image(image, stamp_ns, 'omnicam')
 
 
 def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, models):
@@ -79,20 +73,18 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
     poses = bench.listen(PoseStamped, 'sfa/pose')
     uncertain = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
     turned = bench.listen(QuaternionStamped, 'sfa/turned')
-    sent = panorama(1)
-    bench.publish('panorama', message(image=sent))
+    bench.publish('panorama', message())
     assert until(lambda: slow and features and poses and uncertain)
-    assert list(slow[0].data) == list(range(1, 9))
+    assert list(slow[0].data) == pytest.approx(PLACE, abs=1e-3), 'as the reader says'
     p = features[0].pose.position
-    assert (p.x, p.y, p.z) == (1, 2, 3) and features[0].header.frame_id == 'slow_feature_space'
+    assert (p.x, p.y, p.z) == tuple(slow[0].data)
+    assert features[0].header.frame_id == 'slow_feature_space'
     for pose, stamped in ((poses[0].pose, poses[0]), (uncertain[0].pose.pose, uncertain[0])):
         assert read_stamp(stamped.header.stamp) == 5_000_000_001
         assert stamped.header.frame_id == 'garden'
-        assert (pose.position.x, pose.position.y) == (sent[0, 0, 0], sent[0, 0, 1])
-        assert read_yaw(pose.orientation) == pytest.approx(0.25)
-    assert np.allclose(convert.read_pose(uncertain[0])[2], np.diag([0.04, 0.09, 0.01]))
-    models['a.npz'].explained = EXPLAINED_WARNING - 0.05
-    bench.publish('panorama', message(seed=2))
+        assert read_planar(pose.position, pose.orientation) == pytest.approx(PLACE, abs=1e-3)
+    assert np.allclose(convert.read_pose(uncertain[0])[2], np.diag([0.02, 0.03, 0.002]))
+    bench.publish('panorama', message(seed=2, explained=EXPLAINED_WARNING - 0.05))
     assert until(lambda: 'unlike' in node.health()[1])
     told_of = node.health()[2]
     assert told_of['explained'] == '35 %', 'of the last image'
@@ -103,51 +95,68 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
     assert until(lambda: 'no image on /panorama for' in told[-1].status[0].message)
 
 
-@pytest.mark.parametrize('kind', ['dark', 'frozen', 'foreign'])
+@pytest.mark.parametrize('kind', ['dark', 'frozen', 'foreign', 'not finite'])
 def test_an_unusable_image_gives_no_pose_and_is_reported(bench, models, kind):
     node = bench.run(SfaNode, model='a.npz')
     poses = bench.listen(PoseStamped, 'sfa/pose')
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
     said = bench.listen(DiagnosticArray, '/diagnostics')
-    models['a.npz'].explained = 0.1 if kind == 'foreign' else 0.9
-    image = panorama(5) if kind != 'dark' else np.zeros((SIZE.height, SIZE.width, 3), np.uint8)
+    models['a.npz'].shift = math.nan if kind == 'not finite' else 0.0
+    image = panorama(PLACE, 5, explained=0.1 if kind == 'foreign' else 0.9)
+    image = np.zeros_like(image) if kind == 'dark' else image
     for k in range(FROZEN_IMAGES):
         bench.publish('panorama', message(image=image, stamp_ns=100 + k))
         assert until(lambda n=k: len(heard) == n + 1)
-    covariance = np.reshape(heard[-1].pose.covariance, (6, 6))
-    assert covariance[0, 0] == covariance[1, 1] == UNKNOWN_VARIANCE
+    _, pose, covariance = convert.read_pose(heard[-1])
+    assert covariance[0, 0] == covariance[1, 1] == UNKNOWN_VARIANCE and np.isfinite(pose).all()
     assert len(poses) == (1 if kind == 'frozen' else 0)
     assert until(lambda: said and said[-1].status[0].level != b'\x00')
-    models['a.npz'].explained = 0.9
+    models['a.npz'].shift = 0.0
     bench.publish('panorama', message(seed=77, stamp_ns=200))
     assert until(lambda: poses and read_stamp(poses[-1].header.stamp) == 200)
     refused = node.monitors['panorama'].refused
     assert sum(refused.values()) == FROZEN_IMAGES - (kind == 'frozen')
 
 
-def test_panoramas_of_another_size_are_rejected_with_the_remedy(bench, models):
+def test_panoramas_unlike_those_of_training_are_rejected_with_the_remedy(bench, models):
+    """Of another size, or declared to show something else."""
     node = bench.run(SfaNode, model='a.npz')
+    told = bench.listen(DiagnosticArray, '/diagnostics')
+    heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+    refused = node.monitors['panorama'].refused
     bench.publish('panorama', message(image=np.zeros((20, 100, 3), np.uint8)))
-    assert until(lambda: node.monitors['panorama'].refused)
-    (reason,) = node.monitors['panorama'].refused
-    assert '100x20' in reason and '60x12' in reason and 'omnicam_node' in reason
-    heard = bench.listen(PoseStamped, 'sfa/pose')
-    bench.publish('panorama', message())
+    assert until(lambda: len(refused) == 1)
+    bench.publish('panorama/info', declared(clockwise=False), latched_qos())
+    assert until(lambda: node.monitors['panorama/info'].used == 1)
+    bench.publish('panorama', message(seed=1))
+    assert until(lambda: len(refused) == 2)
+    reasons = ' '.join(refused)
+    for words in (
+        '100x20',
+        f'{SIZE.width}x{SIZE.height}',
+        'clockwise False instead of True',
+        'omnicam_node',
+    ):
+        assert words in reasons
+    assert until(lambda: 'clockwise' in told[-1].status[0].message)
+    assert told[-1].status[0].level == DiagnosticStatus.ERROR and not heard
+    bench.publish('panorama/info', declared(), latched_qos())
+    assert until(lambda: node.monitors['panorama/info'].used == 2)
+    bench.publish('panorama', message(seed=2))
     assert until(lambda: heard)
 
 
 @pytest.mark.parametrize('transport', ['raw', 'compressed'])
 def test_malformed_images_are_counted_and_end_nothing(bench, models, transport):
     """What is wrong with images is tested in test_pictures.py."""
-    stampless, cut = message(), message()
-    stampless.header.stamp.sec = stampless.header.stamp.nanosec = 0
+    stampless, cut = message(stamp_ns=0), message()
     cut.data = bytes(5)
     compressed = CompressedImage(format='jpeg', data=b'no picture')
     compressed.header.stamp.sec = 1
     topic, bad, good = 'panorama', [Image(), stampless, cut], message()
     if transport == 'compressed':
         topic, bad = 'panorama/compressed', [CompressedImage(), compressed]
-        good = convert.to_compressed(panorama(), 7, 'omnicam', 90)
+        good = convert.to_compressed(panorama(PLACE), 7, 'omnicam', 90)
     node = bench.run(SfaNode, model='a.npz', image_transport=transport)
     heard, refused = bench.listen(PoseStamped, 'sfa/pose'), node.monitors[topic].refused
     for count, broken in enumerate(bad, 1):
@@ -158,62 +167,43 @@ def test_malformed_images_are_counted_and_end_nothing(bench, models, transport):
     assert until(lambda: heard)
 
 
-def test_an_estimate_that_is_not_finite_is_never_published(bench, models):
-    node = bench.run(SfaNode, model='a.npz')
-    models['a.npz'].shift = math.nan
-    heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
-    bench.publish('panorama', message())
-    assert until(lambda: node.monitors['panorama'].refused and heard)
-    _, pose, covariance = convert.read_pose(heard[0])
-    assert np.array_equal(pose, np.zeros(3)) and covariance[0, 0] == UNKNOWN_VARIANCE
-    assert 'no finite estimate' in next(iter(node.monitors['panorama'].refused))
-
-
-def test_the_model_changes_while_running_and_a_bad_one_is_refused(bench, models, tmp_path):
-    """What a model knows of its errors reaches those who come later, too."""
+@pytest.mark.parametrize('state', ['unconfigured', 'inactive', 'active'])
+def test_the_model_changes_in_every_state_and_a_bad_one_is_refused(bench, models, tmp_path, state):
+    """The record of the robot reaches late subscribers, too."""
     models['b.npz'].error_correlation = ErrorCorrelation(0.5, 3.0)
     models['b.npz'].rig = Rig(wheel_scale=Quantity(1.02, 0.01))
-    node = bench.run(SfaNode, model='a.npz')
-    heard = bench.listen(PoseStamped, 'sfa/pose')
-    told = bench.listen(String, 'sfa/rig', latched_qos())
-    assert until(lambda: told) and convert.read_rig(told[0]) == (Rig(), KNOWN)
-    assert node.set_parameters([Parameter('model', value='b.npz')])[0].successful
-    assert until(lambda: len(told) == 2)
-    assert convert.read_rig(told[1]) == (models['b.npz'].rig, ErrorCorrelation(0.5, 3.0))
-    bench.publish('panorama', message(seed=1))
-    assert until(lambda: heard) and heard[0].pose.position.x >= 100
+    node = bench.run(SfaNode, start=state == 'active', model='a.npz')
+    if state == 'inactive':
+        node.trigger_configure()
     (tmp_path / 'damaged.npz').write_bytes(b'PK damaged')
     for path in (tmp_path / 'damaged.npz', 'none.npz', 300 * 'x'):
         refused = node.set_parameters([Parameter('model', value=str(path))])[0]
         assert not refused.successful and str(path) in refused.reason
-    assert node.get_parameter('model').value == 'b.npz'
-    bench.publish('panorama', message(seed=2))
-    assert until(lambda: len(heard) == 2) and heard[1].pose.position.x >= 100
-    models['b.npz'] = FakeModel(shift=500.0)
-    assert bench.call(Trigger, 'sfa_node/reload_model', Trigger.Request()).success
-    bench.publish('panorama', message(seed=3))
-    assert until(lambda: len(heard) == 3) and heard[2].pose.position.x >= 500
-    del models['b.npz']
-    answer = bench.call(Trigger, 'sfa_node/reload_model', Trigger.Request())
-    assert not answer.success and 'b.npz' in answer.message
-
-
-@pytest.mark.parametrize('state', ['unconfigured', 'inactive'])
-def test_a_model_is_checked_in_every_state_and_the_one_reported_is_in_use(bench, models, state):
-    node = bench.run(SfaNode, start=False, model='a.npz')
-    if state != 'unconfigured':
-        node.trigger_configure()
-    refused = node.set_parameters([Parameter('model', value='none.npz')])[0]
-    assert not refused.successful and 'none.npz' in refused.reason
     assert node.get_parameter('model').value == 'a.npz'
     assert node.set_parameters([Parameter('model', value='b.npz')])[0].successful
     if state == 'unconfigured':
         node.trigger_configure()
-    node.trigger_activate()
-    heard = bench.listen(PoseStamped, 'sfa/pose')
+    if state != 'active':
+        node.trigger_activate()
+    heard, rigs = bench.listen(PoseStamped, 'sfa/pose'), []
+    bench.node.create_subscription(String, 'sfa/rig', rigs.append, latched_qos())
+    assert until(lambda: rigs)
+    assert convert.read_rig(rigs[-1]) == (models['b.npz'].rig, ErrorCorrelation(0.5, 3.0))
     bench.publish('panorama', message())
     assert until(lambda: heard) and heard[0].pose.position.x >= 100
     assert node.health()[2]['model'] == 'b.npz'
+
+
+def test_the_model_is_read_again_when_asked(bench, models):
+    bench.run(SfaNode, model='b.npz')
+    heard = bench.listen(PoseStamped, 'sfa/pose')
+    models['b.npz'] = ShiftedReader(shift=500.0)
+    assert bench.call(Trigger, 'sfa_node/reload_model', Trigger.Request()).success
+    bench.publish('panorama', message())
+    assert until(lambda: heard) and heard[0].pose.position.x >= 500
+    del models['b.npz']
+    answer = bench.call(Trigger, 'sfa_node/reload_model', Trigger.Request())
+    assert not answer.success and 'b.npz' in answer.message
 
 
 def test_a_missing_model_is_named_with_the_remedy(bench, models):
@@ -222,22 +212,3 @@ def test_a_missing_model_is_named_with_the_remedy(bench, models):
         assert not node.start()
         assert why in node.failure and 'train' in node.failure
         bench.end(node)
-
-
-def test_panoramas_declared_to_show_something_else_are_rejected(bench, models):
-    node = bench.run(SfaNode, model='a.npz')
-    told = bench.listen(DiagnosticArray, '/diagnostics')
-    heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
-    other = dataclasses.replace(SIZE, clockwise=False)
-    for count, declared in enumerate((other, SIZE), 1):
-        bench.publish('panorama/info', convert.to_info(declared), latched_qos())
-        assert until(lambda n=count: node.monitors['panorama/info'].used == n)
-        bench.publish('panorama', message(seed=count))
-        if declared is SIZE:
-            break
-        assert until(lambda: node.monitors['panorama'].refused)
-        (reason,) = node.monitors['panorama'].refused
-        assert 'clockwise False instead of True' in reason and 'omnicam' in reason
-        assert until(lambda: told and 'clockwise' in told[-1].status[0].message)
-        assert told[-1].status[0].level == DiagnosticStatus.ERROR and not heard
-    assert until(lambda: heard)

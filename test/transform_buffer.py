@@ -1,17 +1,14 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What tf2 does with the transforms of one pair of frames: sorted by time, interpolated between."""
+"""What tf2 does with the transforms of a pair of frames: it interpolates between neighbors."""
 
 import json
-import math
 
 import numpy as np
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
 from sfa_localization.data.messages import read_stamp, read_yaw
-
-KEPT_NS = 10_000_000_000
 
 
 class AsText(String):
@@ -27,37 +24,25 @@ class AsText(String):
 
 
 class TransformBuffer:
-    """tf2's buffer in the plane; of equal stamps the one that came last is the later one."""
+    """tf2's buffer in the plane."""
 
     def __init__(self):
-        self._entries = []
+        self._poses = {}
 
     def add(self, message):
         """Insert what an AsText holds."""
-        for stamp_ns, pose in json.loads(message.data):
-            self.insert(stamp_ns, np.array(pose))
-
-    def insert(self, stamp_ns, pose):
-        """Insert a transform (3,); too old a one is dropped, as those that it makes too old."""
-        if self._entries and stamp_ns < self.newest_ns - KEPT_NS:
-            return
-        place = sum(stamp <= stamp_ns for stamp, _ in self._entries)
-        self._entries.insert(place, (stamp_ns, pose))
-        newest_ns = self.newest_ns
-        self._entries = [entry for entry in self._entries if entry[0] >= newest_ns - KEPT_NS]
+        self._poses.update(json.loads(message.data))
 
     @property
     def newest_ns(self):
-        return self._entries[-1][0]
+        return max(self._poses)
 
     def lookup(self, stamp_ns):
         """The transform (3,) at a time; LookupError outside of what is held."""
-        if stamp_ns == self.newest_ns:
-            return self._entries[-1][1]
-        if not self._entries[0][0] <= stamp_ns < self.newest_ns:
+        stamps_ns = np.array(sorted(self._poses))
+        if not stamps_ns[0] <= stamp_ns <= stamps_ns[-1]:
             raise LookupError(f'{stamp_ns} would require extrapolation')
-        after = sum(stamp <= stamp_ns for stamp, _ in self._entries)
-        (early_ns, early), (late_ns, late) = self._entries[after - 1 : after + 1]
-        step = late - early
-        step[2] = math.remainder(step[2], 2 * math.pi)
-        return early + step * (stamp_ns - early_ns) / (late_ns - early_ns)
+        poses = np.array([self._poses[stamp] for stamp in stamps_ns.tolist()])
+        poses[:, 2] = np.unwrap(poses[:, 2])
+        times = (stamps_ns - stamp_ns).astype(float)
+        return np.array([np.interp(0.0, times, column) for column in poses.T])

@@ -1,10 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fields of ROS messages as numbers, the same for messages of bags and of topics.
+"""Fields of ROS messages as numbers, for messages of bags and of topics.
 
-Takes any object with the fields of the message, and depends on neither ROS nor rosbags. Stamps are
-integer nanoseconds, poses (x m, y m, yaw rad). A message that cannot be used raises MessageError
-with a short reason that can be counted.
+Takes any object with the fields of the message, and needs neither ROS nor rosbags. Stamps are
+integer nanoseconds, poses (x m, y m, yaw rad). An unusable message raises MessageError with a short
+reason, so that reasons can be counted.
 """
 
 from __future__ import annotations
@@ -17,18 +17,17 @@ from sfa_localization.data.errors import MessageError
 NANOSECONDS = 1_000_000_000
 NO_STAMP = 'zero or negative stamp'
 _LARGEST = 1e9
-"""No robot reaches this number of m, rad, m/s or rad/s: such a field was never set."""
+"""No robot reaches this number of m, rad, m/s or rad/s: the field was never set."""
 LARGEST_VARIANCE = 1e6
-"""Drivers mark an unknown variance by numbers as large as this (SI units); so do the nodes."""
+"""Drivers, and the nodes, mark an unknown variance by numbers this large (SI units)."""
 LARGEST_TWIST_VARIANCE = 1e2
-"""The same of speeds and turn rates: nothing is known of one that may be off by 10 m/s or rad/s."""
+"""The same for speeds and turn rates: a standard deviation of 10 m/s or rad/s says nothing."""
 LARGEST_SCALE = 1.5
-"""A larger factor on the way of odometry is none of wheels, but of another unit."""
+"""A larger scale of odometry is no error of wheels, but another unit."""
 _SHORTEST_QUATERNION = 1e-3
 """A shorter quaternion has no direction; normalized ones have length 1."""
-
 _STEEPEST = math.radians(45.0)
-"""No robot on wheels rolls or pitches so much: the IMU has other axes, as z down."""
+"""No robot on wheels rolls or pitches this much: the axes of the IMU are others, as z down."""
 
 
 def read_stamp(stamp: Any) -> int:
@@ -56,7 +55,7 @@ def read_planar(position: Any, orientation: Any) -> tuple[float, float, float]:
 
 
 def read_twist(message: Any) -> tuple[float, float, float, float]:
-    """v m/s and omega rad/s of an Odometry, and their variances, 0 where unknown."""
+    """v m/s and omega rad/s of an Odometry, and their variances, 0 if unknown."""
     twist, covariance = message.twist.twist, message.twist.covariance
     v, omega = float(twist.linear.x), float(twist.angular.z)
     require_sane('twist', v, omega)
@@ -64,7 +63,7 @@ def read_twist(message: Any) -> tuple[float, float, float, float]:
 
 
 def read_yaw_rate(message: Any) -> tuple[float, float]:
-    """omega rad/s of an Imu about its z axis, and its variance, 0 where unknown."""
+    """omega rad/s of an Imu about its z axis, and its variance, 0 if unknown."""
     if message.angular_velocity_covariance[0] == -1.0:
         raise MessageError('the message marks its yaw rate as unknown')
     omega = float(message.angular_velocity.z)
@@ -103,5 +102,5 @@ def require_sane(name: str, *numbers: float) -> None:
 
 
 def _variance(value: float) -> float:
-    """A variance of a twist, or 0 (unknown) where the message holds an impossible one."""
+    """A variance of a twist, or 0 (unknown) for an impossible one."""
     return float(value) if math.isfinite(value) and 0 < value < LARGEST_TWIST_VARIANCE else 0.0

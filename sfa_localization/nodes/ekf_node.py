@@ -334,7 +334,8 @@ class EkfNode(LocalizationNode):
         status = self.status()
         if status.level is Level.LOCALISED:
             self._reliable = self.filter.state
-        text = ': '.join([status.level.name, '; '.join(status.reasons)]).rstrip(': ')
+        reasons = '; '.join(status.reasons)
+        text = f'{status.level.name}: {reasons}' if reasons else status.level.name
         level, before, published_s = self._published_state
         changed, now_s = status.level is not level, steady_s()
         if changed or (text != before and now_s > published_s + _REPEAT_STATE_S):

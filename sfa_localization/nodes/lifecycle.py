@@ -215,14 +215,11 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         return False
 
     def refuse(self, topic: str, reason: str) -> int:
-        """Count a rejected message; log the first of a reason, then each thousandth.
-
-        Returns how often this reason has occurred.
-        """
+        """Count a rejection; log the first of a reason and each thousandth; return the count."""
         count = self.monitors[topic].refused.add(reason)
         if count == 1 or count % 1000 == 0:
-            line = f'{self.full_name(topic)}: {short_line(reason)} ({count} so far)'
-            self.get_logger().warning(line)
+            where = self.full_name(topic)
+            self.get_logger().warning(f'{where}: {short_line(reason)} ({count} so far)')
         return count
 
     def defect(self, name: str, error: Exception) -> None:
@@ -307,12 +304,14 @@ def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
     logger = rclpy.logging.get_logger(_PACKAGE)
     try:
         _initialize(words)
+        executor = SingleThreadedExecutor()  # after a signal it cannot be made
         node = make()
         parameters.warn_of_arguments(node, words)
         if not node.start():
             return entry.CANNOT_START if rclpy.ok() else 0
+        executor.add_node(node)
         with one_core():
-            _spin(node)
+            _spin(executor, node)
     except LocalizationError as error:
         logger.fatal(str(error))
         return entry.CANNOT_START
@@ -323,7 +322,7 @@ def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
         return entry.DIED if node is not None and node.active else entry.CANNOT_START
     finally:
         if node is not None:
-            node.teardown()
+            node.attempt('cleanup', node.teardown)
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
@@ -347,13 +346,11 @@ def _initialize(words: list[str]) -> None:
         )
 
 
-def _spin(node: LocalizationNode) -> None:
+def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
     """Spin until a signal.
 
     rclpy raises RuntimeError for a transition that does not fit, ValueError for a negative clock.
     """
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
     while rclpy.ok():
         try:
             executor.spin_once(_WAKE_PERIOD_S)

@@ -90,11 +90,11 @@ def _typed(item: dataclasses.Field[Any], given: Parameter) -> Parameter:
 
     ROS reads 3 as an integer, and gives an empty list any type.
     """
-    value, numbers = given.value, (int, float)
+    value = given.value
     if isinstance(item.default, float) and type(value) is int:
         return Parameter(item.name, value=float(value))
     is_list = isinstance(item.default, tuple) and isinstance(value, (list, tuple, array.array))
-    if is_list and all(type(entry) in numbers for entry in value):
+    if is_list and all(type(entry) in (int, float) for entry in value):
         return Parameter(item.name, Parameter.Type.DOUBLE_ARRAY, [float(x) for x in value])
     return given
 

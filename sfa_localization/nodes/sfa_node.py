@@ -135,7 +135,7 @@ class SfaNode(LocalizationNode):
             raise MessageError(observation.problem)
 
     def _publish(self, seen: Observation) -> None:
-        """Publish an observation; of an unusable image, the pose with its large covariance only."""
+        """Publish an observation; a pose of an unusable image only with its large covariance."""
         frame, slow, stamp_ns = self._config.map_frame, seen.slow_features, seen.stamp_ns
         if np.all(np.isfinite(slow)):
             self._features.publish(convert.to_array(slow, 'slow features'))

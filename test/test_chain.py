@@ -1,0 +1,209 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Chains of nodes: two robots in one domain; and the same poses live, in `Localizer`, offline."""
+
+import json
+
+import numpy as np
+import pytest
+from picture_readers import SIZE, PictureReader, Recording, panorama
+
+from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.data.events import ODOMETRY
+from sfa_localization.data.run import Trajectory
+from sfa_localization.evaluation import evaluate, fit_transform, moved
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.localizer import Localizer
+from sfa_localization.place_model import PlaceModel
+
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from ros_bench import until
+from std_msgs.msg import String
+from transform_buffer import AsText
+
+from sfa_localization.data.messages import read_planar, read_stamp
+from sfa_localization.nodes import ekf_node
+from sfa_localization.nodes.conversions import to_image, to_odometry
+from sfa_localization.nodes.ekf_node import EkfNode
+from sfa_localization.nodes.omnicam_node import OmnicamNode
+from sfa_localization.nodes.sfa_node import SfaNode
+
+pytestmark = pytest.mark.ros
+START_NS = 1_700_000_000_000_000_000
+FRAMES = ('odom', 'base_link')
+
+
+@pytest.fixture(autouse=True)
+def reader(monkeypatch):
+    """Every model reads the pose off the picture."""
+    monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
+
+
+def pose_of(message):
+    pose = message.pose.pose if isinstance(message, Odometry) else message.pose
+    return read_planar(pose.position, pose.orientation)
+
+
+PLACES = {'robot1': (3.0, 4.0, 0.5), 'robot2': (20.0, 11.0, -1.0)}
+PARAMETERS = f"""
+/**/omnicam_node:
+  ros__parameters: {{camera_model: panorama, width: {SIZE.width}, height: {SIZE.height}}}
+/**:
+  ros__parameters: {{model: model.npz}}
+/robot1/ekf_node:
+  ros__parameters: {{lost_std: 1.5}}
+robot2:
+  ekf_node:
+    ros__parameters: {{lost_std: 1.8}}
+"""
+
+
+@pytest.fixture
+def robots(bench, tmp_path, monkeypatch):
+    """Return the nodes of each robot."""
+    monkeypatch.setattr(ekf_node, 'TFMessage', AsText)
+    path = tmp_path / 'robots.yaml'
+    path.write_text(PARAMETERS)
+    arguments = ['--ros-args', '--params-file', str(path), '-r', '/tf:=tf']
+    return {
+        name: [
+            bench.run(kind, options={'namespace': name, 'cli_args': arguments})
+            for kind in (OmnicamNode, SfaNode, EkfNode)
+        ]
+        for name in PLACES
+    }
+
+
+def drive(bench, done):
+    """Send both robots' images and odometry in turns, until something is so."""
+    spread, zero = np.eye(2) * 1e-4, np.zeros(3)
+    for step in range(1, 1200):
+        stamp_ns = START_NS + step * 50_000_000
+        standing = to_odometry(zero, np.eye(3), zero[:2], spread, stamp_ns, FRAMES)
+        for name, place in PLACES.items():
+            bench.publish(f'/{name}/odom', standing)
+            image = to_image(panorama(place, seed=step), stamp_ns, 'omnicam')
+            bench.publish(f'/{name}/image_raw', image)
+        if until(done, 0.05):
+            return True
+    return False
+
+
+def test_two_robots_side_by_side_locate_themselves(bench, robots):
+    """Images and odometry alternate in one domain; no message of one reaches the other."""
+    fused = {name: bench.listen(Odometry, f'/{name}/ekf/odometry') for name in PLACES}
+    moved = {name: bench.listen(String, f'/{name}/tf') for name in PLACES}
+    told = bench.listen(DiagnosticArray, '/diagnostics')
+
+    def located():
+        return all(
+            moved[name] and fused[name] and np.allclose(pose_of(fused[name][-1]), place, atol=0.1)
+            for name, place in PLACES.items()
+        )
+
+    assert drive(bench, located)
+    limits = {name: nodes[2].get_parameter('lost_std').value for name, nodes in robots.items()}
+    assert limits == {'robot1': 1.5, 'robot2': 1.8}, 'each has its own section of the file'
+    for name, place in PLACES.items():
+        # The odometry stands at its origin: the transform is the place in the map.
+        sent = [pose[:2] for message in [*moved[name]] for _, pose in json.loads(message.data)]
+        assert np.allclose(sent, place[:2], atol=0.5)
+    assert bench.node.count_publishers('/tf') == 0
+    monitors = [m for nodes in robots.values() for node in nodes for m in node.monitors.values()]
+    assert not any('internal error' in reason for m in monitors for reason in m.refused)
+    for k, topic in ((2, 'odom'), (0, 'image_raw')):
+        received = [nodes[k].monitors[topic].received for nodes in robots.values()]
+        assert np.ptp(received) <= 3, 'one robot hears the other'
+    statuses = {s.name: {v.key for v in s.values} for m in [*told] for s in m.status}
+    nodes = 'omnicam_node', 'sfa_node', 'ekf_node'
+    assert set(statuses) == {f'{name}/{node}: status' for name in PLACES for node in nodes}
+    assert '/robot1/odom: received' in statuses['robot1/ekf_node: status']
+    assert '/robot2/panorama: received' in statuses['robot2/sfa_node: status']
+
+
+SEEN = 'sfa/pose_with_covariance'
+WATCH, FILTER = {'least_explained': 0.3}, {'measurement_factor': 2.0}
+"""Settings of sfa_node and ekf_node that differ from the defaults, and matter here."""
+
+
+def message_of(recording, stamp_ns, kind, index):
+    """Return topic and message of an event, as a robot sends it."""
+    if kind != ODOMETRY:
+        return 'panorama', to_image(recording.pictures[index], stamp_ns, 'omnicam')
+    drive, i = recording.drive, recording.kept[index]
+    motion = drive.reckoned[i], np.eye(3), drive.read[i], np.diag(drive.variances())
+    return 'odom', to_odometry(*motion, stamp_ns, FRAMES)
+
+
+def trajectory(messages):
+    stamps_ns = [read_stamp(m.header.stamp) for m in messages]
+    return Trajectory(np.array(stamps_ns, np.int64), np.array([pose_of(m) for m in messages]))
+
+
+def live(bench, recording):
+    """Return what sfa_node and ekf_node publish: poses of pictures, and of the filter."""
+    sfa = bench.run(SfaNode, model='reader.npz', **WATCH)
+    ekf = bench.run(EkfNode, **FILTER)
+    seen, fused = bench.listen(PoseStamped, 'sfa/pose'), bench.listen(Odometry, 'ekf/odometry')
+    # The latched record of the robot is there before the first picture.
+    assert until(lambda: ekf.monitors['sfa/rig'].used == 1)
+    inputs = [sfa.monitors['panorama'], ekf.monitors[SEEN], ekf.monitors['odom']]
+    for event in recording.events():
+        topic, message = message_of(recording, *event)
+        is_image = topic == 'panorama'
+        due = is_image, is_image and message.width == SIZE.width, not is_image
+        counts = [m.received + is_due for m, is_due in zip(inputs, due, strict=True)]
+        bench.publish(topic, message)
+        assert until(lambda c=counts: [m.received for m in inputs] == c)
+    last = int(recording.drive.stamps_ns[-1])
+    assert until(lambda: fused and read_stamp(fused[-1].header.stamp) == last)
+    return trajectory(seen), trajectory(fused)
+
+
+def same(a, b):
+    assert np.array_equal(a.stamps_ns, b.stamps_ns)
+    assert np.allclose(a.poses[:, :2], b.poses[:, :2], rtol=0, atol=1e-9)
+    assert np.allclose(np.exp(1j * a.poses[:, 2]), np.exp(1j * b.poses[:, 2]), atol=1e-9)
+
+
+def test_live_nodes_localizer_and_evaluate_give_the_same_poses(bench, tmp_path):
+    recording = Recording()
+    seen, fused = live(bench, recording)
+    config, watch = FilterConfig(**FILTER), WatchConfig(**WATCH)
+
+    # Without ROS, message by message.
+    localizer = Localizer(PictureReader(), config, watch)
+    stamps, poses = [], []
+    for stamp_ns, kind, index in recording.events():
+        if kind == ODOMETRY:
+            i = recording.kept[index]
+            told = recording.drive.variances(), recording.drive.reckoned[i]
+            state = localizer.add_odometry(stamp_ns, *recording.drive.read[i], *told)
+            if state is not None:
+                stamps.append(stamp_ns)
+                poses.append(state.pose)
+        elif recording.pictures[index].shape[1] == SIZE.width:
+            localizer.add_panorama(stamp_ns, recording.pictures[index])
+    same(fused, Trajectory(np.array(stamps), np.array(poses)))
+
+    # From the bag, in batches; the map is laid on the truth.
+    judged = evaluate(
+        PictureReader(), recording.write(tmp_path / 'drive'), config=config, watch=watch
+    )
+    to_truth = fit_transform((judged.truth, seen))
+    same(moved(seen, to_truth), judged.estimates['sfa'])
+    same(moved(fused, to_truth), judged.estimates['ekf'])
+
+    # The pictures were what they are meant to be, and the filter knew where it was.
+    assert judged.counts['observations']['skipped'] == {
+        'image is unlike any of training': 4,
+        'image is dark': 2,
+        'image is covered: it shows nothing': 1,
+        'image repeats the one before': 3,
+        'camera is frozen: it repeats its image': 6,
+    }
+    assert judged.scores['ekf']['p95'] < 0.3
