@@ -76,10 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser, name: str) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Make what is missing of the studies; print their tables."""
-    config, start = (
-        settings(StudyConfig, arguments),
-        'study_quick_' if arguments.quick else 'study_',
-    )
+    config = settings(StudyConfig, arguments)
+    start = 'study_quick_' if arguments.quick else 'study_'
     if bool(arguments.training) != bool(arguments.test):
         raise ConfigError('--training and --test: give both, or neither')
     chosen = (*NAMES, 'light') if arguments.study == 'all' else (arguments.study,)
@@ -87,9 +85,9 @@ def run(arguments: argparse.Namespace) -> int:
     if paper:
         _paper(paper, arguments.out or Path(f'{start}paper'), config, arguments)
     if 'light' in chosen:
-        own = arguments.out and (arguments.out / 'light' if paper else arguments.out)
+        out = arguments.out and (arguments.out / 'light' if paper else arguments.out)
         plan = light.QUICK if arguments.quick else light.FULL
-        cells = light.fill_matrix(own or Path(f'{start}light'), config, plan, progress=True)
+        cells = light.fill_matrix(out or Path(f'{start}light'), config, plan, progress=True)
         print(light_report.table(cells))
     if 'year' in chosen:
         months = year.QUICK_YEAR if arguments.quick else year.YEAR

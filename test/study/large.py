@@ -63,9 +63,9 @@ def _judge(out: Path, config: StudyConfig, area: tuple[float, float], every: flo
     frame = align(places, truth)
     model, recipe = trained.model, as_live(Recipe(), trained.model.panorama)
     run, seen = observed(bags[1], Observer(model), recipe, progress=True)
-    usable = [one for one in seen if not one.problem]
-    stamps = np.array([one.stamp_ns for one in usable])
-    single = Trajectory(stamps, np.array([one.pose for one in usable]))
+    usable = [image for image in seen if not image.problem]
+    stamps = np.array([image.stamp_ns for image in usable])
+    single = Trajectory(stamps, np.array([image.pose for image in usable]))
     path, sure = _fused(model, run, seen)
     ekf = score(run.ground_truth, moved(path, frame))
     back = list(_recoveries(model, run, seen, frame))
@@ -90,7 +90,7 @@ def _fused(
     carried to where it was so much later.
     """
     localizer, states, odometry = Localizer(model), [], run.odometry
-    for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, [one.stamp_ns for one in seen]):
+    for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, [o.stamp_ns for o in seen]):
         if at_ns <= stamp_ns < at_ns + ahead_ns:
             continue
         now_ns = stamp_ns - (ahead_ns if stamp_ns >= at_ns else 0)
@@ -113,7 +113,7 @@ def _recoveries(
     for k in range(KIDNAPPINGS):
         at_ns, ahead_ns = round(start + (end - start) * (0.2 + 0.05 * k)), (end - start) * 2 // 5
         path, sure = _fused(model, run, seen, at_ns, ahead_ns)
-        apart = moved(path, frame).poses[:, :2] - run.ground_truth.at(path.stamps_ns)[:, :2]
-        back = sure & (np.hypot(*apart.T) < RIGHT_M) & (path.stamps_ns >= at_ns + ahead_ns)
+        errors = moved(path, frame).poses[:, :2] - run.ground_truth.at(path.stamps_ns)[:, :2]
+        back = sure & (np.hypot(*errors.T) < RIGHT_M) & (path.stamps_ns >= at_ns + ahead_ns)
         seconds = (path.stamps_ns[back] - at_ns - ahead_ns) * 1e-9
         yield float(seconds.min(initial=np.inf))

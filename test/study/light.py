@@ -66,7 +66,7 @@ class LightPlan:
     area: tuple[float, float]
     panorama: tuple[int, int]
     tests: tuple[Condition, ...]
-    left_out: tuple[str, ...]
+    untrained_lights: tuple[str, ...]
     minutes: int
 
 
@@ -95,7 +95,7 @@ def trainings(plan: LightPlan) -> Iterator[Training]:
     """The models of a plan: one for each row, and for `ALL_BUT` one for each light left out."""
     for trained, lights in TRAININGS.items():
         yield Training(trained, lights, plan.tests)
-    for light in plan.left_out:
+    for light in plan.untrained_lights:
         others = tuple(other for other in LIGHTS if other != light)
         yield Training(ALL_BUT, others, tuple(test for test in plan.tests if test[0] == light))
 
@@ -164,7 +164,7 @@ def fill_matrix(
     report.say(f'this takes about {plan.minutes} minutes on two cores{done}')
     work = _Work(out, config, plan, report)
     for training in trainings(plan):
-        missing = [test for test in training.tests if not _found(results, training.trained, test)]
+        missing = [test for test in training.tests if not _is_done(results, training.trained, test)]
         if missing:
             _fill(work, replace(training, tests=tuple(missing)), results.keep)
     save_text(out / 'matrix.md', table(cells) + '\n')
@@ -173,7 +173,7 @@ def fill_matrix(
     return cells
 
 
-def _found(results: Results, trained: str, test: Condition) -> bool:
+def _is_done(results: Results, trained: str, test: Condition) -> bool:
     return results.find(trained=trained, light=test[0], season=test[1]) is not None
 
 
@@ -240,8 +240,8 @@ def _slow_alone(model: PlaceModel, run: Run, transform: RigidTransform) -> Cell:
     """Scores of the map without the keyframes, but for the headings that these show."""
     truth = _truth(run)
     places = model.metric.predict(features_of(turned_of(model), run))[0]
-    found = Trajectory(truth.stamps_ns, flat(places))
-    return _summary(score(truth, moved(found, transform)))
+    estimate = Trajectory(truth.stamps_ns, flat(places))
+    return _summary(score(truth, moved(estimate, transform)))
 
 
 def _paper_recipe(model: PlaceModel, training: Run) -> Callable[[Run], Cell]:

@@ -117,10 +117,10 @@ def _condition(cell: Mapping[str, Any]) -> str:
 
 
 def _value(cell: Mapping[str, Any], measure: Measure) -> float | None:
-    found: Any = cell
+    value: Any = cell
     for name in measure.path:
-        found = (found or {}).get(name)
-    return None if found is None else float(found)
+        value = (value or {}).get(name)
+    return None if value is None else float(value)
 
 
 def _text(measure: Measure, value: float | None) -> str:

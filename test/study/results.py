@@ -58,8 +58,8 @@ class Results:
         """
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            found = _found(file, beside, settings)
-            same, cells = found['settings'] == settings, list(found['cells'])
+            content = _content(file, beside, settings)
+            same, cells = content['settings'] == settings, list(content['cells'])
         except OSError as error:
             reason = error.strerror or error
             raise LocalizationError(f'{file}: {reason}: choose another folder with --out') from None
@@ -86,14 +86,14 @@ class Results:
         return next((c for c in self.cells if names.items() <= c.items()), None)
 
 
-def _found(file: Path, beside: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
+def _content(file: Path, beside: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
     """What the file holds; the settings of one beside it, or the new ones in an empty folder."""
     kin = [file.with_name(name) for name in beside if file.with_name(name).exists()]
     if not file.exists() and not kin and not any(file.parent.iterdir()):
         return {'settings': settings, 'cells': []}
     source = kin[0] if kin and not file.exists() else file
-    found = dict(json.loads(source.read_text(encoding='utf-8')))
-    return found if source == file else {**found, 'cells': []}
+    content = dict(json.loads(source.read_text(encoding='utf-8')))
+    return content if source == file else {**content, 'cells': []}
 
 
 def usual_drift(area: Sequence[float]) -> float:

@@ -139,8 +139,8 @@ def _fill(work: _Work, results: Results) -> None:
                 continue
             work.progress.say(f'{month}, {light}, {season}: {name}')
             # The map of a model that was trained anew lies elsewhere.
-            known = None if name == 'retrained' else transform
-            scores, fitted = _judged(model, work.drive(number), work.drive(0), known)
+            given = None if name == 'retrained' else transform
+            scores, fitted = _judged(model, work.drive(number), work.drive(0), given)
             transform = transform if name == 'retrained' else fitted
             names = {'model': name, 'month': month, 'light': light, 'season': season}
             results.keep({**names, **scores})
