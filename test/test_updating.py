@@ -16,7 +16,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.run import Odometry
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.updating import Additions, usual_explained, extended, new_views
+from sfa_localization.updating import Additions, extended, new_views, usual_explained
 
 
 def repainted(share):

@@ -27,16 +27,16 @@ STUDIES = {
     'all': 'the next five, which take hours',
     'simulator': "the paper's experiment in its simulator",
     'robot': "the paper's experiment with a robot, simulated",
-    'baselines': 'other features in the place of slow ones',
+    'baselines': 'other features instead of slow features',
     'ablations': 'this package without some of its parts',
     'light': 'train in one, two or three lights, test in every light and season',
-    'year': 'train once, then a drive a month, with and without updates of the model',
+    'year': 'train once, then drive each month, with and without updates of the model',
     'large': 'gardens of 16 m x 18 m to 64 m x 72 m, at one density of drives',
 }
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run what the first word names; the exit code."""
+    """Run the study that the first word names; return the exit code."""
     arguments = study_parser().parse_args(words)
     return guarded(lambda: int(arguments.run(arguments)))
 
@@ -75,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser, name: str) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Make what is missing of the studies; print their tables."""
+    """Complete the studies, and print their tables."""
     config = settings(StudyConfig, arguments)
     start = 'study_quick_' if arguments.quick else 'study_'
     if bool(arguments.training) != bool(arguments.test):
@@ -104,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _paper(
     names: Sequence[str], out: Path, config: StudyConfig, arguments: argparse.Namespace
 ) -> None:
-    """Those results that share a folder: say how long they take, then make what is missing."""
+    """Announce the duration of the paper's results, then complete them in one folder."""
     plan, training = QUICK if arguments.quick else FULL, tuple(arguments.training)
     work = Work(out, config, plan, Progress(shown=True), training, arguments.test)
     lights = light.QUICK if arguments.quick else light.FULL

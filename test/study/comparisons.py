@@ -73,7 +73,7 @@ def baselines(site: Site, results: Results, world: str) -> None:
 
 
 def _judged(site: Site, study: Study, model: PlaceModel, name: str) -> Cell:
-    """Errors of one kind of features, or the `problem` that they have."""
+    """Errors of a kind of features, or the `problem` if they give no map."""
     rows = study.laid_on(SegmentConfig())
     if name == RETRIEVAL:
         return _retrieved(study)
@@ -94,7 +94,7 @@ def _judged(site: Site, study: Study, model: PlaceModel, name: str) -> Cell:
 
 
 def _retrieved(study: Study) -> Cell:
-    """The true position of the training image that is likest."""
+    """Errors of the true position of the most similar training image."""
     poses = np.column_stack([study.places, np.zeros(len(study.places))])
     retrieval = ImageRetrieval.of((image for batch in study.batches() for image in batch), poses)
     images = (i for batch in study.test.panoramas.batches(BATCH) for i in batch)
@@ -103,7 +103,7 @@ def _retrieved(study: Study) -> Cell:
 
 
 class SlowFeaturesAlone(PlaceModel):
-    """A model that reads the place off slow features; what it turns is turned as keyframes say."""
+    """A model with positions from slow features, turned by the headings of the keyframes."""
 
     @classmethod
     def of(cls, model: PlaceModel) -> SlowFeaturesAlone:
@@ -120,7 +120,7 @@ class SlowFeaturesAlone(PlaceModel):
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """This package with one thing different. `layers` empty: the standard network."""
+    """This package with a change. Empty `layers` mean the standard network."""
 
     metric: MetricConfig = field(default_factory=MetricConfig)
     segments: SegmentConfig = field(default_factory=SegmentConfig)
@@ -149,12 +149,12 @@ class Variant:
         return mine == (MetricConfig(), SegmentConfig(), True, False, False)
 
     def recipe(self, base: Recipe) -> Recipe:
-        """How it trains."""
+        """The recipe of the training."""
         network = replace(base.network, normalization=self.normalization)
         return replace(base, network=network, metric=self.metric, segments=self.segments)
 
     def drives(self, study: Study) -> tuple[Run, ...]:
-        """What its map is learned from."""
+        """The drives from which the map is learned."""
         runs = study.training[-1:] if self.single_drive else study.training
         return tuple(map(_exact, runs)) if self.exact_odometry else runs
 
@@ -218,7 +218,7 @@ def ablations(site: Site, results: Results, world: str) -> None:
 
 
 def _exact(run: Run) -> Run:
-    """A drive whose odometry does not err."""
+    """A drive with exact odometry."""
     assert run.ground_truth is not None
     return replace(run, odometry=Odometry.along(run.ground_truth), yaw_rate=None)
 

@@ -31,7 +31,7 @@ AREAS = {(16.0, 18.0): 0.2, (32.0, 36.0): 0.2, (64.0, 72.0): 0.3}
 QUICK_AREAS = {(8.0, 8.0): 0.2}
 PANORAMA = 300, 30
 KIDNAPPINGS, RIGHT_M = 6, 0.6
-"""How often the robot is carried along its test drive, and the error of a recovered estimate."""
+"""Number of kidnappings along the test drive, and the largest error of a recovered estimate."""
 
 
 def judge_areas(out: Path, config: StudyConfig, areas: dict[tuple[float, float], float]) -> str:
@@ -86,8 +86,8 @@ def _judge(out: Path, config: StudyConfig, area: tuple[float, float], every: flo
 def _fused(
     model: PlaceModel, run: Run, seen: Sequence[Observation], at_ns: int = 0, ahead_ns: int = 0
 ) -> tuple[Trajectory, Array]:
-    """The filter at the images, and whether it was LOCALISED there; at some stamp the robot is
-    carried to where it was so much later.
+    """The filter's path at the images, and whether it was LOCALISED; at `at_ns` the robot is moved
+    to where it was `ahead_ns` later.
     """
     localizer, states, odometry = Localizer(model), [], run.odometry
     for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, [o.stamp_ns for o in seen]):

@@ -26,7 +26,7 @@ Cells = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """A score of a cell: its `path` in it, how it is written, and how bad it is, 0 good to 1."""
+    """A score of a cell: its `path`, its format, and its badness from 0 to 1 for the color."""
 
     title: str
     path: tuple[str, ...]

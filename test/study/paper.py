@@ -83,7 +83,7 @@ def experiment(site: Site, results: Results, name: str, seed: int, figures: Path
 def _by_recipe(
     study: Study, features: tuple[Array, Array], config: MetricConfig
 ) -> tuple[Cell, Paths | None]:
-    """Errors of the map of the slow features (N, K) and (T, K) that the straight lines give."""
+    """Errors of the map of slow features (N, K) and (T, K), learned from the straight lines."""
     segments = study.segments(STRAIGHT, only_last=True)
     rows = study.laid_on(STRAIGHT)
     try:
@@ -99,7 +99,7 @@ def _by_recipe(
 
 
 def _correlation(result: MetricResult, segments: Segments) -> ErrorCorrelation:
-    """Of the errors of images that are left out, along straight lines."""
+    """The correlation of errors of left-out images along straight lines."""
     stack = Stack.of(segments)
     way_m = np.cumsum(stack.steps)
     return ErrorCorrelation.fit(result.left_out, result.left_out_variance, way_m, stack.owner)
@@ -166,7 +166,7 @@ def random_parameters(lines: int, terms: int, size: Array, seed: int) -> Complex
 
 
 def _nearest_frame(places: Array, truth: Array) -> tuple[float, RigidTransform]:
-    """-1 for the mirror image of places (M, 2), else 1, and what then lays them on the truth."""
+    """-1 if the mirror image of places (M, 2) fits the truth better, else 1; and its alignment."""
     made = [(side, align(places * [1, side], truth)) for side in (1.0, -1.0)]
     return min(made, key=lambda k: mean_error(k[1].apply(places * [1, k[0]]), truth))
 
@@ -186,7 +186,7 @@ def _figures(folder: Path, name: str, study: Study, paths: dict[str, Paths]) -> 
 
 
 def _panels(trial: Trial, part: int, owner: NDArray[np.int64]) -> list[report.Panel]:
-    """Of the training drive (part 0) or the test drive (1): supervised, raw, laid on the truth."""
+    """Panels of the training drive (part 0) or the test drive (1): supervised, raw, aligned."""
     truth, groups = trial.truth[part], None if part else owner[trial.rows]
     return [
         report.Panel('supervised', truth, trial.supervised[part], groups),

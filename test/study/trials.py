@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""One place, some training drives and one to test on; and maps from any features, judged there.
+"""Maps from any features, judged on training drives and a test drive in one place.
 
-Every map is judged by the paper's protocol (section 4): laid on the truth by its estimates of a
-training drive, and compared with a regression of the same features on the truth.
+Every map is judged by the paper's protocol (section 4): aligned with the truth on a training drive,
+and compared with a regression of the same features on the truth.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ TRUE_START = FilterConfig(initial_position_std=0.02, initial_yaw_std=0.02)
 """Section 5.1: the robot starts from a known location, with known heading; as from a dock."""
 STRAIGHT = SegmentConfig(segments='straight')
 MONOMIALS = MetricConfig(metric_map='monomials', slow_features=PAPER_FEATURES)
-"""Of the paper's recipe."""
+"""Settings of the paper's recipe."""
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """Training drives and a drive to test on, with the true positions (N, 2) and (T, 2) m of
-    their images; the map is laid on the truth by the last training drive.
+    """Training drives and a test drive, with the true positions (N, 2) and (T, 2) m of images; the
+    map is aligned on the last training drive.
     """
 
     drives: tuple[Drive, ...]
@@ -61,7 +61,7 @@ class Study:
 
     @classmethod
     def read(cls, bags: Sequence[Path], test: Path, cache: Path, recipe: Recipe) -> Study:
-        """From bags; their images go to the folder `cache`. Raises BagError or DataError."""
+        """Read bags; their images go to the folder `cache`. Raises BagError or DataError."""
         drives = []
         for bag in [*bags, test]:
             folder = cache / bag.name
@@ -89,13 +89,13 @@ class Study:
         return [sum(counts[:k]) for k in range(len(counts))]
 
     def segments(self, config: SegmentConfig, only_last: bool = False) -> Segments:
-        """Segments of all training drives, or of the last one; by rows among the images of all."""
+        """Segments of all training drives or of the last one, as rows among the images of all."""
         first = len(self.training) - 1 if only_last else 0
         cut = [Drives((drive,), Closures.none(), config).cut() for drive in self.drives[first:]]
         return join(cut, self.starts[first:])
 
     def laid_on(self, config: SegmentConfig) -> Rows:
-        """Rows of the images that the map is laid on the truth by: in segments of the last one."""
+        """Rows of the images in segments of the last drive, on which the map is aligned."""
         segments = self.segments(config, only_last=True)
         return self.with_truth(np.concatenate([segment.images for segment in segments]))
 
@@ -134,7 +134,7 @@ def slow_of(network: Network) -> Features:
 
 
 def turned_of(model: PlaceModel) -> Features:
-    """What a model's map reads: maps turned by keyframes, reduced, or else slow features."""
+    """The features of a model's map: reduced turned maps, or slow features without them."""
     turned = model.turned
     if turned is None:
         return slow_of(model.network)
@@ -235,18 +235,16 @@ def start_of(run: Run) -> Array:
 
 
 def true_start(run: Run, transform: RigidTransform) -> FilterConfig:
-    """The filter's settings for a start at the true pose, in the map that `transform` lays on the
-    truth.
-    """
+    """The filter's settings for a start at the true pose; `transform` leads from map to truth."""
     laid = np.array([transform.x_m, transform.y_m, transform.yaw_rad])
     return replace(TRUE_START, initial_pose=tuple(compose(invert(laid), start_of(run)).tolist()))
 
 
 def mean_distance(path: Trajectory, truth: Trajectory) -> float:
-    """Mean distance (m) of a path from the true one, where that is known."""
+    """Mean distance (m) of a path from the truth, where the truth covers it."""
     return float(score(truth, path)['mean'])
 
 
 def mean_error(places: Array, truth: Array) -> float:
-    """Mean distance (m) of places (N, 2) from true ones (N, 2), where these are known."""
+    """Mean distance (m) of places (N, 2) from true ones (N, 2), without NaN."""
     return float(np.nanmean(np.hypot(*(places - truth).T)))

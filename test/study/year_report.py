@@ -43,7 +43,7 @@ def _models(cells: Cells) -> list[str]:
 
 
 def _mean(cells: Cells, name: str, model: str) -> float | None:
-    """Of a model that was judged in every month: other months are easier or harder."""
+    """The mean of a measure for a model that was judged in every month."""
     values = [c[name] for c in cells if c['model'] == model and c.get(name) is not None]
     return sum(values) / len(values) if len(values) == len(_months(cells)) else None
 
