@@ -63,8 +63,9 @@ def load_settings(path: Path | str, section: str, kind: type[S]) -> S:
     Raises ConfigError with file, section and parameter for an invalid file.
     """
     parameters = load_section(Path(path), section)
-    names = {item.name for item in dataclasses.fields(kind)} & parameters.keys()
-    return kind.from_mapping({name: parameters[name] for name in names}, f'{path}: {section}')
+    names = {item.name for item in dataclasses.fields(kind)}
+    chosen = {name: value for name, value in parameters.items() if name in names}
+    return kind.from_mapping(chosen, f'{path}: {section}')
 
 
 def load_section(path: Path, section: str) -> dict[str, Any]:
