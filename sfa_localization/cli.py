@@ -10,8 +10,7 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sfa_localization import __version__
@@ -32,8 +31,7 @@ COMMANDS = {
     'demo': 'Simulate, train, run the three nodes live, and print their errors (about 5 minutes).',
 }
 LONGEST_ERROR = 4000
-"""Characters of an error: the last lines of a program that failed, or a list of topics."""
-_NO_ROOM = 'failed to map segment'  # of a library, where there is no memory for it
+"""Longest error message, in characters; the middle of a longer one is left out."""
 OPTIONAL = {
     'trimesh': 'trimesh embreex',
     'embreex': 'trimesh embreex',
@@ -42,7 +40,7 @@ OPTIONAL = {
     'threadpoolctl': 'threadpoolctl, or: sudo apt install python3-threadpoolctl',
     'rclpy': '"ros-jazzy-rclpy[fastrtps]" ros-jazzy-common-interfaces, or source ROS 2',
 }
-"""Packages that only some commands need, and how to install them."""
+"""Packages that only some commands need, and what pip installs for them."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -50,29 +48,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     _prepare_streams()
     words = list(sys.argv[1:] if argv is None else argv)
     name = words[0] if words else ''
-    with nullcontext() if name in NODES else _terminable():
-        return guarded(lambda: _run(name, words))
-
-
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end a command like Ctrl-C, so that it can clean up."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    # Signals that are ignored, as after nohup, stay ignored.
-    numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) != signal.SIG_IGN]
-    before = {number: signal.signal(number, interrupt) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    for number in (signal.SIGTERM, signal.SIGHUP) if name not in NODES else ():
+        if signal.getsignal(number) != signal.SIG_IGN:  # as after nohup
+            signal.signal(number, signal.default_int_handler)  # like Ctrl-C, to clean up
+    return guarded(lambda: _run(name, words))
 
 
 def _run(name: str, words: Sequence[str]) -> int:
-    """Run a node, which reads its ROS arguments itself, or a command; the exit code."""
+    """Run a node, which parses its ROS arguments itself, or a command; return the exit code."""
     if name in NODES:
         return entry.run(name, words)
     if name not in COMMANDS:
@@ -83,7 +66,7 @@ def _run(name: str, words: Sequence[str]) -> int:
 
 
 def _prepare_streams() -> None:
-    """Open those that are closed; let names of files that are not UTF-8 be printed, as \\udcff."""
+    """Open closed streams; escape names of files that are not UTF-8, as \\udcff."""
     for name in ('stdout', 'stderr'):
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), 'w'))
@@ -93,7 +76,7 @@ def _prepare_streams() -> None:
 
 
 def _flush() -> None:
-    """Write what was printed, or give it up. Raises BrokenPipeError or LocalizationError."""
+    """Flush standard output. Raises BrokenPipeError or LocalizationError."""
     try:
         sys.stdout.flush()
     except OSError as error:
@@ -104,7 +87,7 @@ def _flush() -> None:
 
 
 def executable() -> int:
-    """Run the command that this executable is named after, for `ros2 run sfa_localization`."""
+    """Run the command with the name of this executable, for `ros2 run sfa_localization`."""
     return main([Path(sys.argv[0]).stem, *sys.argv[1:]])
 
 
@@ -135,45 +118,36 @@ def _overview() -> argparse.ArgumentParser:
     return parser
 
 
-def _shortened(text: str) -> str:
-    """The text, with the middle left out where it quotes a long one."""
-    half = LONGEST_ERROR // 2
-    return text if len(text) <= LONGEST_ERROR else f'{text[:half]} ... {text[-half:]}'
-
-
-def _in_one_line(error: LocalizationError) -> str:
-    """The text of an error, with newlines of names escaped; programs that failed keep theirs."""
-    if isinstance(error, NodeError):
-        return str(error)
-    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error))
-
-
 def guarded(run: Callable[[], int]) -> int:
-    """Turn expected errors into one line and exit code 1, Ctrl-C into 130."""
+    """Return the exit code of `run`; print an expected error and return 1, after Ctrl-C 130."""
     try:
         try:
             return run()
-        finally:  # also after help of argparse
+        finally:  # also after argparse has printed help
             _flush()
     except BrokenPipeError:  # the reader, such as head, has closed the pipe
         return 0
     except LocalizationError as error:
-        reason = _in_one_line(error)
+        reason = str(error)
+        if not isinstance(error, NodeError):  # which quotes lines; names of files are escaped
+            reason = ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in reason)
     except ModuleNotFoundError as error:
         package = (error.name or '').partition('.')[0]
         if package not in OPTIONAL:
             raise
         reason = f'{package} is not installed; this needs it: pip install {OPTIONAL[package]}'
     except (OSError, MemoryError) as error:
-        # Of the machine: a full disk, too many open files.
+        # A full disk, for example, or too many open files.
         reason = ' '.join(str(error).split()) or 'not enough memory'
     except (KeyboardInterrupt, ImportError) as error:
-        # Of a C++ library that was interrupted while it was loaded it is the cause.
+        # KeyboardInterrupt is the cause if the import of a C++ library was interrupted.
         if isinstance(error.__cause__ or error, KeyboardInterrupt):
             print('interrupted', file=sys.stderr)
             return 130
-        if _NO_ROOM not in str(error):
+        if 'failed to map segment' not in str(error):  # of a library, for lack of memory
             raise
         reason = 'not enough memory'
-    print(f'error: {_shortened(reason)}', file=sys.stderr)
+    if len(reason) > LONGEST_ERROR:
+        reason = f'{reason[: LONGEST_ERROR // 2]} ... {reason[-LONGEST_ERROR // 2 :]}'
+    print(f'error: {reason}', file=sys.stderr)
     return 1

@@ -45,12 +45,10 @@ SECTIONS: dict[str, tuple[type[Settings], ...]] = {
 }
 """The settings of each section; the trainer reads camera and panorama from omnicam_node."""
 _KEY = 'ros__parameters'
-_NODES = tuple(section for section in SECTIONS if section.endswith('_node'))
 _WILDCARDS = {'**': r'(/\w+)*', '*': r'/\w+'}
 _ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
-"""Parameters that rclpy declares for every node; no settings of this package."""
-_WIDTH = 100
-_MISSPELT = 0.85  # similarity of names; ekf_filter_node, of another package, has 0.7
+"""Parameters that rclpy declares for every node."""
+_MISSPELT = 0.85  # similarity of names; ekf_filter_node of robot_localization has 0.7
 _HEAD = """\
 # Every parameter of sfa_localization, with its default; all are optional.
 # Nodes read this file with --ros-args --params-file FILE, commands with --config FILE.
@@ -60,23 +58,23 @@ _HEAD = """\
 
 
 def load_settings(path: Path | str, section: str, kind: type[S]) -> S:
-    """Return the settings `kind` of one section; parameters that it lacks have their defaults.
+    """Return the settings `kind` of a section; missing parameters have their defaults.
 
     Raises ConfigError with file, section and parameter for an invalid file.
     """
     parameters = load_section(Path(path), section)
     names = {item.name for item in dataclasses.fields(kind)}
-    own = {name: value for name, value in parameters.items() if name in names}
-    return kind.from_mapping(own, f'{path}: {section}')
+    chosen = {name: value for name, value in parameters.items() if name in names}
+    return kind.from_mapping(chosen, f'{path}: {section}')
 
 
 def load_section(path: Path, section: str) -> dict[str, Any]:
-    """Return the parameters of one section of any namespace, and those of `/**` that it has.
+    """Return the parameters of a section in any namespace, and its parameters in `/**`.
 
-    Parameters of ROS, such as `use_sim_time`, are kept. Raises ConfigError, also for sections of
-    several namespaces that differ: a command cannot choose between robots.
+    Parameters of ROS, such as `use_sim_time`, are kept. Raises ConfigError, also if sections of
+    several namespaces differ: a command cannot choose between robots.
     """
-    known = _items(section)
+    items = _items(section)
     shared: dict[str, Any] = {}
     robots: dict[str, dict[str, Any]] = {}
     for key, values in _sections(path).items():
@@ -87,16 +85,16 @@ def load_section(path: Path, section: str) -> dict[str, Any]:
                 f'a namespace, and /**'
             )
         if node in _WILDCARDS:
-            _require_known(values, all_names(), f'{path}: {key}')
+            _check_names(values, all_names(), f'{path}: {key}')
             shared.update(values)
         elif node == section:
-            _require_known(values, known, f'{path}: {section}')
+            _check_names(values, items, f'{path}: {section}')
             robots.setdefault(namespace, {}).update(values)
-    given = {**shared, **_of_any_robot(robots, f'{path}: {section}')}
+    given = {**shared, **_merged(robots, f'{path}: {section}')}
     return {
-        name: _value(known[name], value) if name in known else value
+        name: _value(items[name], value) if name in items else value
         for name, value in given.items()
-        if name in known or _is_of_ros(name)
+        if name in items or _is_of_ros(name)
     }
 
 
@@ -111,7 +109,7 @@ def all_names() -> set[str]:
 
 
 def _is_of_ros(name: str) -> bool:
-    """Whether ROS declares the parameter, written as a tree or with dots."""
+    """Whether rclpy declares the parameter, written as a tree or with dots."""
     return name.partition('.')[0] in _ROS_PARAMETERS
 
 
@@ -121,22 +119,20 @@ def load_changes(path: Path | str) -> dict[str, dict[str, Any]]:
 
 
 def ignored_sections(path: Path | str, node: str) -> list[str]:
-    """Return the keys of a file's sections that are for a node, and of which ROS gives it nothing.
+    """Return the keys of sections that are meant for a node but that ROS does not give to it.
 
-    `node` is the full name, such as /robot1/ekf_node. A section's own name may be misspelt; others
-    are of other namespaces, where there is none for this one. Raises ConfigError for an unreadable
-    file.
+    `node` is the full name, such as /robot1/ekf_node. The name in the key is misspelt, or if no
+    section matches, its namespace is wrong. Raises ConfigError for an unreadable file.
     """
-    name = _node_of(node)
-    keys = [*_sections(Path(path))]
+    keys, name = [*_sections(Path(path))], _node_of(node)
+    same_name = [key for key in keys if _node_of(key) == name]
     misspelt = [
         key
         for key in keys
         if difflib.get_close_matches(_node_of(key), {*SECTIONS, name}, 1, _MISSPELT) == [name]
-        and _node_of(key) != name
+        and key not in same_name
     ]
-    own = [key for key in keys if _node_of(key) == name]
-    return misspelt + ([] if any(_matches(key, node) for key in keys) else own)
+    return misspelt + ([] if any(_matches(key, node) for key in keys) else same_name)
 
 
 def given_names(path: Path | str, node: str) -> set[str]:
@@ -155,18 +151,18 @@ def _node_of(key: str) -> str:
 
 
 def _matches(key: str, node: str) -> bool:
-    """Whether ROS gives a section to a node of this full name."""
+    """Whether ROS gives a section to a node with this full name."""
     parts = (_WILDCARDS.get(part, '/' + re.escape(part)) for part in key.split('/') if part)
     return re.fullmatch(''.join(parts), node) is not None
 
 
 def _sections(path: Path) -> dict[str, dict[str, Any]]:
-    """Return the parameters of each section by its key; namespaces are joined by slashes.
+    """Return the parameters of each section by its key, with namespaces joined by slashes.
 
-    As in ROS, `robot1: {ekf_node: ...}` and `/robot1/ekf_node: ...` are the same.
+    As in ROS, `robot1: {ekf_node: ...}` and `/robot1/ekf_node: ...` are equivalent.
     """
     try:
-        # No pipe: it is empty when the next section is read.
+        # Not from a pipe, which would be empty for the next section.
         document = load_yaml(read_regular(path, LONGEST).decode())
     except (UnicodeDecodeError, OSError) as error:
         reason = error.strerror or error if isinstance(error, OSError) else error.reason
@@ -177,19 +173,19 @@ def _sections(path: Path) -> dict[str, dict[str, Any]]:
         return {}
     if not isinstance(document, dict):
         raise ConfigError(f'{path}: must hold sections such as {", ".join(SECTIONS)}')
-    found: dict[str, dict[str, Any]] = {}
+    sections: dict[str, dict[str, Any]] = {}
     for name, part in document.items():
-        _collect(str(name), part, path, found)
-    return found
+        _collect(str(name), part, path, sections)
+    return sections
 
 
-def _collect(key: str, part: Any, path: Path, found: dict[str, dict[str, Any]]) -> None:
-    """Add the sections below one key: itself, or those of the namespace that it names."""
+def _collect(key: str, part: Any, path: Path, sections: dict[str, dict[str, Any]]) -> None:
+    """Add the section of a key, or the sections of the namespace that the key names."""
     inner = part if isinstance(part, dict) else {}
     nested = bool(inner) and _node_of(key) not in SECTIONS and _KEY not in inner
     if nested and all(isinstance(below, dict) for below in inner.values()):
         for name, below in inner.items():
-            _collect(f'{key}/{str(name).lstrip("/")}', below, path, found)
+            _collect(f'{key}/{str(name).lstrip("/")}', below, path, sections)
         return
     if part is not None and (not isinstance(part, dict) or (part and set(part) != {_KEY})):
         raise ConfigError(
@@ -198,38 +194,35 @@ def _collect(key: str, part: Any, path: Path, found: dict[str, dict[str, Any]]) 
     values = inner.get(_KEY) or {}
     if not isinstance(values, dict):
         raise ConfigError(f'{path}: {key}.{_KEY} must hold names and values')
-    found.setdefault(key, {}).update({str(name): value for name, value in values.items()})
+    sections.setdefault(key, {}).update({str(name): value for name, value in values.items()})
 
 
-def _of_any_robot(robots: Mapping[str, Mapping[str, Any]], where: str) -> dict[str, Any]:
-    """Return the parameters of {namespace: parameters}; wildcards are those of no robot.
+def _merged(robots: Mapping[str, Mapping[str, Any]], where: str) -> dict[str, Any]:
+    """Return the parameters of {namespace: parameters}; namespaces override wildcards.
 
-    Raises ConfigError for a parameter that two robots have with different values.
+    Raises ConfigError if two robots have different values of a parameter.
     """
-    general: dict[str, Any] = {}
-    own: dict[str, Any] = {}
+    merged: dict[str, Any] = {}
     for namespace, values in robots.items():
-        if '*' in namespace:
-            general.update(values)
-            continue
-        for name, value in values.items():
-            if name in own and own[name] != value:
+        for name, value in values.items() if '*' not in namespace else ():
+            if name in merged and merged[name] != value:
                 raise ConfigError(
-                    f'{where}: {name} is {quoted(own[name])} for one robot and {quoted(value)} '
+                    f'{where}: {name} is {quoted(merged[name])} for one robot and {quoted(value)} '
                     f'for another: give commands a file of one robot'
                 )
-        own.update(values)
-    return {**general, **own}
+            merged[name] = value
+    wild = [values for namespace, values in robots.items() if '*' in namespace]
+    return {name: value for values in [*wild, merged] for name, value in values.items()}
 
 
-def _require_known(values: Mapping[str, Any], known: Collection[str], where: str) -> None:
+def _check_names(values: Mapping[str, Any], names: Collection[str], where: str) -> None:
     for name in values:
-        if name not in known and not _is_of_ros(name):
-            raise ConfigError(f'{where}: unknown parameter {quoted(name)}{nearest(name, known)}')
+        if name not in names and not _is_of_ros(name):
+            raise ConfigError(f'{where}: unknown parameter {quoted(name)}{nearest(name, names)}')
 
 
 def _value(item: dataclasses.Field[Any], value: Any) -> Any:
-    """Convert as ROS does: for YAML 1.1, 1e-3 is a string; an integer is accepted as a float."""
+    """Convert to float as ROS does: from an integer, or from 1e-3, a string in YAML 1.1."""
     if isinstance(item.default, float) and type(value) in (str, int):
         try:
             return float(value)
@@ -242,11 +235,13 @@ def render(changes: Mapping[str, Mapping[str, Any]] | None = None) -> str:
     """Return the parameter file: defaults, replaced by `changes` {section: {name: value}}."""
     parts = [_HEAD]
     for section, kinds in SECTIONS.items():
-        prefix = '/**/' if section in _NODES else ''
+        prefix = '/**/' if section.endswith('_node') else ''
         parts.append(f'{prefix}{section}:\n  {_KEY}:\n')
         changed = (changes or {}).get(section, {})
         parts += [_group(kind, changed) for kind in kinds]
-        parts.append(_ros_group({n: value for n, value in changed.items() if _is_of_ros(n)}))
+        if of_ros := {name: value for name, value in changed.items() if _is_of_ros(name)}:
+            text = yaml.safe_dump(of_ros, sort_keys=False, allow_unicode=True)
+            parts.append(textwrap.indent(f'# --- Parameters of ROS.\n{text}', '    '))
     return ''.join(parts)
 
 
@@ -260,16 +255,9 @@ def _group(kind: type[Settings], changes: Mapping[str, Any]) -> str:
     title = (kind.__doc__ or '').strip().splitlines()[0]
     lines = [f'    # --- {title}']
     for item in dataclasses.fields(kind):
-        lines += [f'    # {line}' for line in textwrap.wrap(_described(item), _WIDTH - 6)]
+        lines += [f'    # {line}' for line in textwrap.wrap(_described(item), 94)]
         lines.append(f'    {item.name}: {_text(changes.get(item.name, item.default))}')
     return '\n'.join(lines) + '\n'
-
-
-def _ros_group(values: Mapping[str, Any]) -> str:
-    if not values:
-        return ''
-    text = yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True)
-    return textwrap.indent(f'# --- Parameters of ROS.\n{text}', '    ')
 
 
 def _described(item: dataclasses.Field[Any]) -> str:
@@ -289,12 +277,8 @@ def _described(item: dataclasses.Field[Any]) -> str:
 
 
 def _text(value: Any) -> str:
-    """Return a value as YAML 1.1 has it: a float with a decimal point, since 1e-3 is a string."""
-    if isinstance(value, (tuple, list)):
-        return '[' + ', '.join(_text(entry) for entry in value) + ']'
-    if isinstance(value, bool):
-        return str(value).lower()
+    """Return a value in YAML 1.1, strings in quotes."""
     if isinstance(value, str):
         return "'" + value.replace("'", "''") + "'"
-    digits, e, exponent = str(value).partition('e')
-    return f'{digits}{".0" if e and "." not in digits else ""}{e}{exponent}'
+    plain = list(value) if isinstance(value, tuple) else value
+    return yaml.safe_dump(plain, default_flow_style=True, width=1000).splitlines()[0]

@@ -142,7 +142,7 @@ def new_views(
         )
     assert isinstance(smoother, Smoother)
     poses, certain = _smoothed(smoother, model, run)
-    usual = usual_explained_part(model)
+    usual = usual_explained(model)
     novel = np.array([not image.problem and image.explained < usual for image in observations])
     agree = np.array([_agrees(*pair) for pair in zip(observations, poses, strict=True)])
     chosen = np.flatnonzero(np.array(localised) & certain & novel & agree)
@@ -152,7 +152,7 @@ def new_views(
     return Additions(_textures(leveled, chosen), model.rig.camera(poses[chosen]))
 
 
-def usual_explained_part(model: PlaceModel) -> float:
+def usual_explained(model: PlaceModel) -> float:
     """The part of a keyframe that the others explain; 19 of 20 of the training exceed it."""
     keyframes, first = model.keyframes, model.keyframes.first
     explained = list[float]()

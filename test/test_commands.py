@@ -373,16 +373,16 @@ def test_every_option_has_a_case_and_every_case_an_option():
 def test_each_option_alone_has_its_effect(name, data, tmp_path):
     if name in ('play', 'demo'):
         pytest.importorskip('rclpy')
-    failed, known = [], {}
+    failed, outcomes = [], {}
     for words, check in CASES[name].items():
         case = check if isinstance(check, Case) else Case(check)
         base = f'{BASE[name] if case.base is None else case.base} {case.beside}'
         for part in (base, f'{base} {words}'):
-            if part not in known:
-                folder = tmp_path / str(len(known))
+            if part not in outcomes:
+                folder = tmp_path / str(len(outcomes))
                 folder.mkdir()
-                known[part] = run(name, part, folder, data=data)
-        plain, changed = known[base], known[f'{base} {words}']
+                outcomes[part] = run(name, part, folder, data=data)
+        plain, changed = outcomes[base], outcomes[f'{base} {words}']
         if changed.code not in (0, 1) or not case.differs(plain, changed):
             failed.append(f'{plain.text}\n-- with {words}:\n{changed.text}')
     assert not failed, '\n'.join(failed)

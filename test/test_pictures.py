@@ -131,8 +131,8 @@ def test_no_encoding_dies_of_a_tiny_or_odd_picture():
 def test_files_of_every_kind():
     smooth = cv2.resize(np.random.default_rng(2).integers(0, 256, (4, 4, 3), np.uint8), (64, 48))
     for suffix in ('.png', '.bmp', '.ppm', '.tiff', '.jpg', '.webp'):
-        found = decode_compressed(cv2.imencode(suffix, smooth)[1].tobytes())
-        assert np.abs(found.astype(int) - smooth).mean() < (3 if suffix == '.jpg' else 1), suffix
+        image = decode_compressed(cv2.imencode(suffix, smooth)[1].tobytes())
+        assert np.abs(image.astype(int) - smooth).mean() < (3 if suffix == '.jpg' else 1), suffix
     np.testing.assert_array_equal(decode_compressed(encode_png(smooth), 'png'), smooth)
     jpeg = decode_compressed(encode_jpeg(smooth, 95), 'bgr8; jpeg compressed bgr8')
     assert np.abs(jpeg.astype(int) - smooth).mean() < 3
@@ -140,12 +140,9 @@ def test_files_of_every_kind():
     gray = smooth[..., 0]
     image = decode_compressed(encode_png(gray), 'mono8; png compressed mono8')
     np.testing.assert_array_equal(image, np.repeat(gray[..., None], 3, 2))
-
-
-def test_a_compressed_mosaic_is_demosaiced():
     mosaic = np.tile(np.array([[255, 0], [0, 0]], np.uint8), (4, 4))
     image = decode_compressed(encode_png(mosaic), 'bayer_rggb8; png compressed ')
-    assert (image[2:6, 2:6] == RED).all()
+    assert (image[2:6, 2:6] == RED).all(), 'a mosaic'
     plain = decode_compressed(encode_png(mosaic), 'bayer_rggb8; png compressed bgr8')
     assert plain[2, 2].tolist() == [255, 255, 255]
 

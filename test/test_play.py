@@ -126,8 +126,8 @@ def test_topics_are_chosen_and_what_cannot_be_played_is_named(hear, path, tmp_pa
     assert message_class('sensor_msgs/msg/Imu') is Imu
     for kind in ('sensor_msgs/msg/Nothing', 'nowhere_msgs/msg/Imu', '', 'a b/msg/C'):
         assert message_class(kind) is None
-    one = {'sensor_msgs/msg/Imu': 'nowhere_msgs/msg/Imu'}
-    write_database(tmp_path / 'a.db3', messages, kind=lambda name: one.get(name, name))
+    kinds = {'sensor_msgs/msg/Imu': 'nowhere_msgs/msg/Imu'}
+    write_database(tmp_path / 'a.db3', messages, kind=lambda name: kinds.get(name, name))
     played = play(tmp_path / 'a.db3', HURRIED)
     assert '/imu' not in played and played['/odom'] == COUNTS['/odom']
     write_database(tmp_path / 'b.db3', messages, kind=lambda name: 'nowhere_msgs/msg/Any')

@@ -20,8 +20,8 @@ WORSE = 1.25
 def test_the_quick_results_are_as_accurate_as_recorded(name, tmp_path):
     """After an improvement, record its figures: `study NAME --quick`, NAME.json, `columns`."""
     Work(tmp_path, StudyConfig(), QUICK, Progress(False)).reproduced(name)
-    found = json.loads((tmp_path / f'{name}.json').read_text())['cells'][0]['columns']
+    columns = json.loads((tmp_path / f'{name}.json').read_text())['cells'][0]['columns']
     recorded = json.loads(RECORDED.read_text())[name]
     for column, errors in recorded.items():
         for measure, error in errors.items():
-            assert found[column][measure] < WORSE * error, (column, measure)
+            assert columns[column][measure] < WORSE * error, (column, measure)

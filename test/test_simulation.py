@@ -14,7 +14,6 @@ from sfa_localization.camera.settings import CameraConfig, LensCalibration, Pano
 from sfa_localization.data.geometry import compose, relative, wrap_angle
 from sfa_localization.data.run import differences, integrate
 from sfa_localization.fusion.pose_filter import PoseFilter
-from sfa_localization.simulation.daylight import LIGHTS
 from sfa_localization.simulation.drive import (
     START_NS,
     drive,
@@ -23,7 +22,7 @@ from sfa_localization.simulation.drive import (
     roll_and_pitch,
     simulate,
 )
-from sfa_localization.simulation.garden import GRASS, WHITE, Garden, box, panel, rounded
+from sfa_localization.simulation.garden import Garden, panel, rounded
 from sfa_localization.simulation.rendering import Dome, Light, Scene, panorama_view, raw_view
 from sfa_localization.simulation.routes import CLEARANCE_M, Lawn
 from sfa_localization.simulation.seasons import SEASONS
@@ -92,17 +91,11 @@ def test_turning_shifts_columns(tiny):
 
 def test_unwrapped_raw_images_equal_the_panorama(garden):
     pose = np.array([5.0, -6.0, 2.0])
-    panorama = panorama_of(garden, pose, PanoramaConfig())
-    for model, size, mount in (
-        ('mirror', (640, 640), (0.0, 0.0, 0.0)), ('polar', (640, 640), (0.0, 0.0, 30.0)),
-        ('equirectangular', (640, 1280), (0.0, 0.0, 0.0)),
-    ):  # fmt: skip
-        lens = LensCalibration(camera_model=model)
-        camera = make_camera(lens, size, mount_rpy=mount)
-        raw = rounded(garden.image(pose, raw_view(camera.unproject, camera.size)))
-        unwrapped = Unwrapper(CameraConfig(mount_rpy=mount), PanoramaConfig(), lens)(raw)
-        assert psnr(unwrapped, panorama) > 34
-        assert psnr(np.roll(unwrapped, 3, axis=1), panorama) < 30
+    panorama, lens = panorama_of(garden, pose, PanoramaConfig()), LensCalibration()
+    camera = make_camera(lens, (640, 640))
+    raw = rounded(garden.image(pose, raw_view(camera.unproject, camera.size)))
+    unwrapped = Unwrapper(CameraConfig(), PanoramaConfig(), lens)(raw)
+    assert psnr(unwrapped, panorama) > 34 > 30 > psnr(np.roll(unwrapped, 3, axis=1), panorama)
 
 
 def test_pictures_differ_by_place_world_light_and_noise(tiny):
@@ -178,8 +171,6 @@ def test_each_route_is_what_it_promises(garden):
     for part in parts:
         assert np.hypot(*(part[-1] - part[0])[:2]) > 8.0 - 0.4
         assert np.ptp(np.unwrap(part[:, 2])) < 1e-6
-    spread = np.sort([part[0, 2] % np.pi for part in parts])
-    assert np.diff(np.append(spread, spread[0] + np.pi)).max() < 0.6
     poses = drive(garden, SimulationConfig(trajectory='test', seed=7)).truth.poses
     assert np.hypot(*(poses[-1] - poses[0])[:2]) < 0.1
     ways = np.diff(poses, axis=0)
@@ -234,42 +225,6 @@ def test_twist_variance_is_honest(garden):
 
 
 # Light and season
-
-
-def block(name):
-    """A block 1 m wide and 2 m high on a lawn, in fixed exposure, and the direction of the sun."""
-    light, rng = replace(LIGHTS[name], brightness=None), np.random.default_rng(0)
-    sun = light.toward_sun(rng)
-    lawn = panel([-3, -3, 0], [6, 0, 0], [0, 6, 0], 0.1, 'grass', GRASS)
-    block = box(np.zeros(2), np.array([1.0, 1.0, 2.0]), 'plain', WHITE, step=0.1)
-    return Scene([lawn, *block], sun, rng, light), sun
-
-
-def sunshine(scene, points, eye=(0.0, 0.0, 30.0)):
-    """By what part (N,) the sun makes points (N, 3) brighter, seen from an eye."""
-    eye = np.array(eye)
-    rays = (points - eye) / np.linalg.norm(points - eye, axis=1, keepdims=True)
-    dome = Dome(np.zeros(1), len(points), rays[None].astype(np.float32))
-    lit, unlit = (scene.look(eye, 0.0, dome, Light(sun=sun))[0] for sun in (1.0, 0.0))
-    return (lit / unlit).mean(1) - 1
-
-
-def test_shadows_fall_away_from_the_sun_and_walls_toward_it_are_lit():
-    """And an overcast sky casts none."""
-    for name in ('day', 'morning', 'evening'):
-        scene, sun = block(name)
-        level = np.append(sun[:2] / np.hypot(*sun[:2]), 0)
-        shade, lit = sunshine(scene, 1.05 * np.array([-level, level]))
-        assert shade < 0.02 < 0.05 < lit
-        axis = int(np.abs(sun[:2]).argmax())
-        toward, up = np.sign(sun[axis]) * np.eye(3)[axis], np.array([0, 0, 1.2])
-        (lit,) = sunshine(scene, (0.5 * toward + up)[None], 5 * toward + up)
-        (shade,) = sunshine(scene, (-0.5 * toward + up)[None], -5 * toward + up)
-        assert shade < 1e-6 and lit > 0.3
-    scene, _ = block('overcast')
-    around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    ring = 1.2 * np.stack([np.cos(around), np.sin(around), 0 * around], -1)
-    assert sunshine(scene, ring) == pytest.approx(np.zeros(24), abs=1e-6)
 
 
 def test_light_and_season_change_plants_only_and_no_drive():

@@ -21,18 +21,14 @@ from cylinder_worlds import (
 )
 
 from sfa_localization import training
-from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError, LocalizationError, ModelError
 from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run, integrate
-from sfa_localization.evaluation import evaluate
 from sfa_localization.metric import learning
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.summary import summary
 from sfa_localization.sfa import checkpoint as checkpoints
 from sfa_localization.sfa.network_training import ImageSequence, train_network
-from sfa_localization.simulation.drive import simulate
-from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import learn_place, train
 
 
@@ -89,14 +85,12 @@ def test_without_turned_maps_it_learns_without(trained, tmp_path, monkeypatch, c
         caplog.clear()
         with monkeypatch.context() as patch:
             patch.setattr(module, name, value)
-            found = train([trained.bag], tmp_path / 'model.npz', by)
+            learned = train([trained.bag], tmp_path / 'model.npz', by)
         assert said in caplog.text
-        assert found.model.turned is None and 'turned' not in summary(found)
+        assert learned.model.turned is None and 'turned' not in summary(learned)
 
 
-@pytest.mark.parametrize(
-    ('stages', 'error'), [(1, KeyboardInterrupt()), (4, Cut()), (6, KeyboardInterrupt())]
-)
+@pytest.mark.parametrize(('stages', 'error'), [(1, KeyboardInterrupt()), (6, Cut())])
 def test_resuming_gives_the_same_bytes(trained, tmp_path, stages, error):
     """As a training that was not interrupted."""
     output = tmp_path / 'model.npz'
@@ -107,7 +101,7 @@ def test_resuming_gives_the_same_bytes(trained, tmp_path, stages, error):
     assert names(tmp_path) == ['model.npz']
 
 
-def test_a_damaged_checkpoint_and_one_of_something_else_are_refused(trained, tmp_path):
+def test_a_damaged_checkpoint_and_that_of_another_training_are_refused(trained, tmp_path):
     output, checkpoint = tmp_path / 'model.npz', tmp_path / '.model.npz.checkpoint.npz'
     cut_off(trained.bag, output, 2, Cut())
     changed = replace(SMALL_RECIPE, network=replace(SMALL_RECIPE.network, seed=5))
@@ -160,9 +154,9 @@ def test_the_mdp_engine_learns_the_same_place(trained, tmp_path):
         assert abs(np.corrcoef(a, b)[0, 1]) > 0.999
 
 
-def straight_route(speed):
-    """A drive straight ahead of 12 m at 4 Hz and less, whose odometry states no variance."""
-    count = 250
+def straight_route():
+    """A drive straight ahead of 12 m, whose odometry states no variance."""
+    count, speed = 250, 0.12
     stamps = 10**9 + np.arange(count) * round(12e9 / speed / count)
     twists = np.tile([speed, 0.0], (count, 1))
     poses = integrate(stamps, twists, np.array([-6.0, 0.0, 0.0]))
@@ -171,9 +165,8 @@ def straight_route(speed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('speed', [0.03, 0.12])
-def test_one_straight_route_gives_a_model_and_one_sentence(speed, caplog):
-    run = straight_route(speed)
+def test_a_straight_route_gives_a_model_and_a_warning(caplog):
+    run = straight_route()
     network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
     with warnings.catch_warnings(), caplog.at_level(logging.WARNING):
         warnings.simplefilter('error')
@@ -183,10 +176,10 @@ def test_one_straight_route_gives_a_model_and_one_sentence(speed, caplog):
     aside = np.array([[x, 1.5, 0.0] for x in (-2.0, 0.0, 2.0)])
     on = trained.model.locate_all(run.panoramas.read(90, 160))
     off = trained.model.locate_all(Spheres.about(1).panoramas(aside, recipe().panorama))
-    places = np.array([one.position for one in on])
+    places = np.array([image.position for image in on])
     assert np.hypot(*(places - run.odometry.poses[90:160, :2]).T).mean() < 0.1
     surest, least = (
-        pick(np.trace(one.covariance[:2, :2]) for one in part)
+        pick(np.trace(image.covariance[:2, :2]) for image in part)
         for pick, part in ((max, on), (min, off))
     )
     assert least > 10 * surest
@@ -201,16 +194,3 @@ def test_pauses_and_jumps_of_a_drive_are_breaks_between_its_images():
     odometry = Odometry(stamps, np.column_stack([x_m, none]), none, none)
     run = Run('run', images, odometry, counts={'images': Count()})
     assert ImageSequence.of(run).joined.tolist() == [True, True, False, False, True]
-
-
-DRIVE = SimulationConfig(area=(6.0, 6.0), length=20.0, images='panorama', images_every=0.4)
-
-
-@pytest.mark.slow
-def test_a_drive_with_panoramas_of_another_size_trains_and_is_judged(tmp_path):
-    """The network fits itself to them: test_network.py shows it for more."""
-    simulate(DRIVE, tmp_path / 'bag', PanoramaConfig(width=120, height=25))
-    train([tmp_path / 'bag'], tmp_path / 'model.npz')
-    model = PlaceModel.load(tmp_path / 'model.npz')
-    assert (model.panorama.width, model.panorama.height) == (120, 25)
-    assert evaluate(model, tmp_path / 'bag').scores['sfa']['mean'] < 0.5

@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay a bag through rclpy, where `ros2 bag play` is not installed.
+"""Replay a bag through rclpy, also where `ros2 bag play` is not installed.
 
-Messages are published as the recorded bytes, with their topics, types and QoS; header stamps are
-unchanged; the time of reception sets the pace.
+Messages are published as the recorded bytes, with their topics, types, QoS and header stamps, and
+at the pace of the recording.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from sfa_localization.data.rejections import encodable
 if TYPE_CHECKING:
     from sfa_localization.commands.play import PlayConfig
 
-DEPTH = 10  # of a publisher's queue, in messages
-LATCHED_DEPTH = 100  # of the queue that late subscribers receive, in messages
-SETTLED_S = 0.5  # without a new subscriber: all nodes of the chain have started
-CLOCK_PERIOD_S = 0.025  # of /clock, as `ros2 bag play --clock` has
+DEPTH, LATCHED_DEPTH = 10, 100
+"""Messages in the queue of a publisher, and in the queue that late subscribers receive."""
+SETTLED_S = 0.5  # without a new subscriber, all nodes have started
+CLOCK_PERIOD_S = 0.025  # of /clock, as for `ros2 bag play --clock`
 
 
 def play(
@@ -49,13 +49,13 @@ def play(
     clock: bool = False,
     topics: Collection[str] = (),
 ) -> Counter[str]:
-    """Replay a bag until its end, or with `loop` until Ctrl-C; return the messages of each topic.
+    """Replay a bag to its end, or with `loop` until Ctrl-C; return the message count of each topic.
 
-    `topics` limits it to those named. It starts when images and odometry have subscribers and
-    their number is stable, or after the configured wait. Raises BagError.
+    Only the named `topics` are played, all without names. The replay starts when images and
+    odometry have subscribers and no more come, or after `config.wait`. Raises BagError.
     """
     context, played = Context(), Counter[str]()
-    # No arguments: among those of the command may be a name that is not UTF-8.
+    # args=[]: rclpy cannot read names on the command line that are not UTF-8.
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
         with Bag(path) as bag:
@@ -64,9 +64,10 @@ def play(
             _await_subscribers(node, bag, publishers, config.wait)
             ticker = node.create_publisher(Clock, '/clock', DEPTH) if clock else None
             while True:
-                pace = ReplayClock(bag.recording.start_ns, config.rate, ticker)
+                start = time.monotonic()
                 for topic, receive_ns, data in bag.messages(publishers):
-                    pace.wait_until(receive_ns)
+                    bag_s = (receive_ns - bag.recording.start_ns) * 1e-9
+                    _sleep_until(start + bag_s / config.rate, ticker, receive_ns, config.rate)
                     publishers[topic.name].publish(bytes(data))
                     played[topic.name] += 1
                 if not (loop and played):
@@ -81,12 +82,12 @@ def play(
 
 
 def _publishers(node: Node, bag: Bag, names: Collection[str]) -> dict[str, Publisher]:
-    """A publisher for each topic, of all or of those named; others are logged with the reason."""
+    """A publisher for each topic, or for the named ones; logs which cannot be played, and why."""
     topics, made, reasons = bag.topics, dict[str, Publisher](), list[str]()
     for name in names or topics:
         if name not in topics:
-            known = ', '.join(sorted(topics))
-            raise BagError(f'{bag.path}: has no topic {name}; --topics can be: {known}')
+            choices = ', '.join(sorted(topics))
+            raise BagError(f'{bag.path}: has no topic {name}; --topics can be: {choices}')
         topic = topics[name]
         kind = message_class(topic.kind)
         if topic.serialization != 'cdr':
@@ -110,22 +111,22 @@ def _publishers(node: Node, bag: Bag, names: Collection[str]) -> dict[str, Publi
 def _await_subscribers(
     node: Node, bag: Bag, publishers: dict[str, Publisher], wait_s: float
 ) -> None:
-    """Return when images and odometry have subscribers and their number is stable, or in time."""
+    """Wait until images and odometry have subscribers and no more come, `wait_s` at most."""
     kinds = {'images': (IMAGE, COMPRESSED), 'odometry': (ODOMETRY,)}
     needed = {
         what: [made for name, made in publishers.items() if bag.topics[name].kind in kind]
         for what, kind in kinds.items()
     }
-    missing, last, settled = list[str](), 0, time.monotonic()
-    end = settled + wait_s
+    missing, last, changed = list[str](), 0, time.monotonic()
+    end = changed + wait_s
     while (now := time.monotonic()) < end:
         counts = {made: made.get_subscription_count() for made in publishers.values()}
         missing = [
             what for what, group in needed.items() if group and not any(map(counts.get, group))
         ]
         if sum(counts.values()) != last:
-            last, settled = sum(counts.values()), now
-        if last and not missing and now - settled > SETTLED_S:
+            last, changed = sum(counts.values()), now
+        if last and not missing and now - changed > SETTLED_S:
             return
         time.sleep(0.05)
     if missing:
@@ -135,43 +136,29 @@ def _await_subscribers(
         )
 
 
-class ReplayClock:
-    """The time of a bag (ns): from `start_ns` on, `rate` times as fast as a steady clock.
-
-    It is published on the topic of `ticker`, where there is one.
-    """
-
-    def __init__(self, start_ns: int, rate: float, ticker: Publisher | None = None) -> None:
-        self._start_ns, self._rate, self._ticker = start_ns, rate, ticker
-        self._start = self._ticked = time.monotonic()
-
-    def wait_until(self, stamp_ns: int) -> None:
-        """Return when the bag's time is `stamp_ns`."""
-        due = self._start + (stamp_ns - self._start_ns) * 1e-9 / self._rate
-        while (now := time.monotonic()) < due:
-            if self._ticker is not None and now >= self._ticked:
-                passed_ns = int((now - self._start) * self._rate * 1e9)
-                seconds, nanoseconds = divmod(self._start_ns + passed_ns, 10**9)
-                self._ticker.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
-                self._ticked = now + CLOCK_PERIOD_S
-            time.sleep(min(due - now, CLOCK_PERIOD_S))
+def _sleep_until(due: float, ticker: Publisher | None, stamp_ns: int, rate: float) -> None:
+    """Sleep until `due`, by time.monotonic(); `stamp_ns` is the bag's time then, for /clock."""
+    while (left_s := due - time.monotonic()) > 0:
+        if ticker is not None:
+            seconds, nanoseconds = divmod(stamp_ns - int(left_s * rate * 1e9), 10**9)
+            ticker.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
+        time.sleep(min(left_s, CLOCK_PERIOD_S))
 
 
 def message_class(kind: str) -> Callable[..., Any] | None:
-    """The Python class of a message type, or None where it is not installed."""
+    """The Python class of a message type, None if it is not installed."""
     package, _, name = kind.partition('/msg/')
     try:
-        found = getattr(importlib.import_module(f'{package or "unknown"}.msg'), name, None)
+        message = getattr(importlib.import_module(f'{package or "unknown"}.msg'), name, None)
     except ImportError:
         return None
-    return found if isinstance(found, type) else None
+    return message if isinstance(message, type) else None
 
 
 def qos_profile(offered: Collection[Qos]) -> QoSProfile:
-    """QoS to publish with: compatible with every subscriber of the recorded publishers.
+    """The QoS of a publisher that all subscribers of the recorded publishers accept.
 
-    Reliable also satisfies best-effort subscribers, and transient local also volatile ones: where
-    the recorded publishers differ, or their QoS is unknown, the stronger policy is offered.
+    If the recorded publishers differ, or their QoS is unknown, it is reliable and volatile.
     """
     latched = bool(offered) and all(q.durability == QosDurability.TRANSIENT_LOCAL for q in offered)
     weak = bool(offered) and all(q.reliability == QosReliability.BEST_EFFORT for q in offered)

@@ -31,18 +31,18 @@ EXAMPLES = """\
       --check check.png --output camera.yaml
   calibrate --calibration camchain.yaml --output camera.yaml
 
-Look at the check image: it marks the assumed FRONT, LEFT, BACK and RIGHT of the robot, and in the
-panorama below the horizon. Correct the directions with --mount-rpy (ROLLxPITCHxYAW, as 0x0x90),
---axis and --mirrored, the horizon of a mirror with --angle-min and --angle-max: where it lies 5
-degrees above its line, take 5 off both. From circles alone nobody knows these angles.
-omnicam_node reads the file as its parameter calibration_file.
+The check image marks FRONT, LEFT, BACK and RIGHT of the robot, and below, in the panorama, the
+horizon. Correct directions with --mount-rpy (ROLLxPITCHxYAW, as 0x0x90), --axis and --mirrored, and
+the horizon of a mirror with --angle-min and --angle-max: if it lies 5 degrees above its line,
+subtract 5 from both. Circles in the image do not determine these angles.
+omnicam_node reads the file by its parameter calibration_file.
 
 models: mirror (Kalibr omni-radtan, OpenCV omnidir, camodocal MEI; of a fisheye with --mirrored no
 --axis up), fisheye (Kalibr pinhole-equi, OpenCV and ROS fisheye, or from the rim alone), ocam
 (OCamCalib calib_results.txt; of a mirror with --mirrored yes --axis down), polar (from images)"""
 LENS = ('angle_min', 'angle_max', 'axis', 'mirrored')
-_BAGS = {'.mcap', '.db3', '.bag'}  # with folders; all else is an image
-_SAMPLES = 8  # images of a bag: enough to show what changes
+_BAGS = {'.mcap', '.db3', '.bag'}  # beside folders; other files are images
+_SAMPLES = 8  # images read from a bag
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -82,13 +82,13 @@ def run(arguments: argparse.Namespace) -> int:
         options.require_kind(arguments.check, '.png')
     images = _images(arguments)
     config = options.settings(CalibrationConfig, arguments)
-    known = options.given(LensCalibration, arguments)
-    known |= calibration.given_circle(arguments.center, arguments.radii)
-    lens = calibration.calibrate(images, arguments.calibration, config, known)
+    given = options.given(LensCalibration, arguments)
+    given |= calibration.given_circle(arguments.center, arguments.radii)
+    lens = calibration.calibrate(images, arguments.calibration, config, given)
     camera = options.settings(CameraConfig, arguments)
     text = calibration_files.calibration_text(lens, camera.mount_rpy)
     if images:
-        # Without --check too: what is written can be used.
+        # Also without --check, to prove that the calibration is usable.
         check = calibration.check_image(images[0], Unwrapper(camera, PanoramaConfig(), lens))
         if arguments.check:
             with atomic_write(arguments.check, CameraError) as file:
@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _images(arguments: argparse.Namespace) -> Sequence[Image]:
-    """The images of files, or some from all over the drive of a bag."""
+    """The images of files, or samples from all over a bag."""
     from sfa_localization.bags.reader import Bag
     from sfa_localization.camera.calibration import ImageFiles
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulate, train, run the three nodes live, compare with the truth."""
+"""Simulate, train, run the three nodes live, and compare with the truth."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the demonstration; print the errors."""
     from sfa_localization.camera.settings import CameraConfig
     from sfa_localization.commands.live_nodes import commands, run_live
-    from sfa_localization.reports.evaluation import heading_table, table
+    from sfa_localization.reports.evaluation import tables
     from sfa_localization.simulation.drive import simulate
     from sfa_localization.simulation.settings import SimulationConfig
     from sfa_localization.training import Recipe, train
@@ -64,14 +64,14 @@ def run(arguments: argparse.Namespace) -> int:
     result = _compare(trained, live, out, recipe)
     _write_results(out, result, trained)
     announce(f'see {out / "report"}')
-    print(table(result.scores), heading_table(result.scores), sep='\n\n')
+    print(tables(result.scores))
     return 0
 
 
 def prepare_folder(out: Path, world: int) -> None:
-    """Create the folder, or go on in that of a demonstration in the same garden.
+    """Create the folder, or continue in the folder of an earlier demo in the same garden.
 
-    Bags and an unfinished training stay. Raises LocalizationError.
+    Bags and an unfinished training are kept. Raises LocalizationError.
     """
     marker, text = out / MARKER, json.dumps({'world': world, 'version': __version__})
     try:
@@ -89,7 +89,7 @@ def prepare_folder(out: Path, world: int) -> None:
 
 
 def _compare(trained: Trained, live: Live, out: Path, recipe: Recipe) -> Evaluation:
-    """Evaluate the live estimates in the place of those that are fused offline."""
+    """Evaluate offline, then replace the estimates by those of the live nodes."""
     from sfa_localization.evaluation import evaluate, moved, score
 
     offline = evaluate(
@@ -104,17 +104,12 @@ def _compare(trained: Trained, live: Live, out: Path, recipe: Recipe) -> Evaluat
 
 
 def _write_results(out: Path, result: Evaluation, trained: Trained) -> None:
-    """Write errors and figures; firing maps are drawn at the true places of the training images."""
-    import numpy as np
-
-    from sfa_localization.bags.reader import Bag
+    """Write errors and figures, with firing maps at the places of the training images."""
     from sfa_localization.data.files import write_json
     from sfa_localization.reports.evaluation import write_report
 
     write_json(out / 'results.json', result.as_dict())
-    with Bag(out / 'coverage') as bag:
-        truth = bag.trajectory()
-    stamps = np.concatenate([run.panoramas.stamps_ns for run in trained.runs])
-    places = truth.at(stamps)[:, :2]
-    shown = {name: result.estimates[name] for name in ('odometry', 'sfa', 'ekf')}
-    write_report(out / 'report', result.truth, shown, result.scores, places, trained.features)
+    places = result.transform.apply(trained.metric.poses[:, :2])
+    features = trained.features[trained.metric.images]
+    estimates = {name: result.estimates[name] for name in ('odometry', 'sfa', 'ekf')}
+    write_report(out / 'report', result.truth, estimates, result.scores, places, features)

@@ -36,13 +36,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--report', type=Path, metavar='DIR', help='write a contact sheet and the path as PNG'
     )
     parser.add_argument('--strict', action='store_true', help='reject damaged bags')
-    parser.add_argument('--config', type=Path, help='parameter file: are panoramas clockwise?')
+    parser.add_argument('--config', type=Path, help='parameter file, for `clockwise`')
     options.add_topics(parser, 'image', 'odometry', 'imu')
     options.add_settings(parser, InspectionConfig)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Inspect all bags; an unreadable one is reported and does not stop the others."""
+    """Inspect all bags; an unreadable bag is reported, and the others are still inspected."""
     topics = options.settings(TopicNames, arguments)
     config = options.settings(InspectionConfig, arguments)
     clockwise = options.settings(PanoramaConfig, arguments).clockwise
@@ -64,8 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
         _write_report(arguments.report, reports)
     for report in reports:
         print(report.as_text(), file=sys.stderr if report.error else sys.stdout)
-    unreadable = [one for one in reports if one.error or any(t.unreadable for t in one.topics)]
-    return 1 if unreadable else 0
+    return int(any(r.error or any(topic.unreadable for topic in r.topics) for r in reports))
 
 
 def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:
@@ -77,19 +76,20 @@ def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:
     begin_page(folder)
     sections = []
     for number, report in enumerate(reports):
-        stem, shown = Path(report.path).stem, dict[Path, str]()
+        stem, figures = Path(report.path).stem, dict[Path, str]()
         file = f'{number}_{stem}' if len(reports) > 1 else stem
         if report.odometry is not None:
             target, title = folder / f'{file}_path.png', f'{stem}: {report.facts["drive"]}'
             write_path(
                 report.odometry.poses, report.places, title.replace(', along', ',\nalong'), target
             )
-            shown[target] = 'The path by odometry, with the images'
+            figures[target] = 'The path by odometry, with the images'
         if report.samples:
             target = folder / f'{file}_pictures.png'
             title = f'{stem}: {report.image_topic}, {report.camera}'
             write_contact_sheet(report.samples, title, target)
-            shown[target] = 'Images from all over the drive'
-        sections += bag_sections(report.as_dict(), [*map(': '.join, report.facts.items())], shown)
+            figures[target] = 'Images from all over the drive'
+        facts = [': '.join(fact) for fact in report.facts.items()]
+        sections += bag_sections(report.as_dict(), facts, figures)
     write_page(folder, 'What is in the recording', *sections)
     print(f'{folder / PAGE}: written')

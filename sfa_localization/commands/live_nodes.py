@@ -1,8 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The three nodes as real processes in a ROS domain of their own, with a bag player as input.
+"""The three nodes as processes in a separate ROS domain, with a bag player as input.
 
-A recorder subscribes to their outputs; a node that ends or stays silent is an error.
+A recorder subscribes to their outputs; a node that ends or publishes nothing is an error.
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
-from functools import partial
 from pathlib import Path
 from subprocess import DEVNULL, STDOUT, Popen, TimeoutExpired
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import rclpy
@@ -35,19 +34,18 @@ from sfa_localization.nodes.conversions import read_odometry, read_pose
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 PLAYER = 'play'
 POSES = {'sfa_node': 'sfa/pose_with_covariance', 'ekf_node': 'ekf/odometry'}
-"""What is recorded."""
-START_S = 60.0  # until all nodes are connected, on a busy machine
-SETTLE_S = 2.0  # without an output after the replay, which ends the recording
-STOP_S = 10.0  # until outputs, or a process after a signal, have ended
-LARGEST_DOMAIN = 101  # ROS domains above it may collide with ephemeral ports
-# An unknown heading has the variance of the uniform distribution, pi^2 / 3 rad^2.
-KNOWN_YAW_VARIANCE = np.pi**2 / 3 - 0.1
-QUEUE = 1000  # messages: the recorder must not lose any
-LAST_LINES = 5  # of a failed program's output, in the error message
+"""Recorded topics."""
+START_S = 60.0  # limit for the start of all nodes on a busy machine
+SETTLE_S = 2.0  # the recording ends so long after the last output
+STOP_S = 10.0  # limit for outputs after the replay, and for the end of a process after a signal
+LARGEST_DOMAIN = 101  # larger ROS domains may collide with ephemeral ports
+UNKNOWN_YAW_VARIANCE = np.pi**2 / 3 - 0.1  # rad^2; that of a uniform distribution is pi^2 / 3
+QUEUE = 1000  # messages, so that the recorder loses none
+LAST_LINES = 5  # of the output of a failed program, for the error message
 
 
 class Live(NamedTuple):
-    """What the nodes published: poses of single images and of the filter, and the last state."""
+    """The published poses of single images and of the filter, and the last state."""
 
     sfa: Trajectory
     ekf: Trajectory
@@ -55,7 +53,7 @@ class Live(NamedTuple):
 
 
 class Recorder:
-    """A ROS node that records the outputs of the nodes, in a context of its own."""
+    """Records the outputs of the nodes, in a separate ROS context."""
 
     def __init__(self, domain_id: int) -> None:
         self._context = Context()
@@ -68,12 +66,12 @@ class Recorder:
         self._executor.add_node(self._node)
         self.poses: dict[str, list[tuple[int, Array]]] = {name: [] for name in POSES}
         self.last_s, self.state = time.monotonic(), ''
-        for kind, read, (name, topic) in zip(
-            (PoseWithCovarianceStamped, Odometry), (_pose, _odometry), POSES.items(), strict=True
+        for topic, kind, keep in (
+            (POSES['sfa_node'], PoseWithCovarianceStamped, self._keep_pose),
+            (POSES['ekf_node'], Odometry, self._keep_odometry),
+            ('ekf/state', String, self._keep_state),
         ):
-            keep = partial(self._keep, self.poses[name], read)
             self._node.create_subscription(kind, topic, keep, QUEUE)
-        self._node.create_subscription(String, 'ekf/state', self._keep_state, QUEUE)
 
     def close(self) -> None:
         """Leave the ROS graph."""
@@ -81,8 +79,15 @@ class Recorder:
         self._node.destroy_node()
         self._context.try_shutdown()
 
-    def _keep(self, poses: list[tuple[int, Array]], read: Any, message: Any) -> None:
-        poses.append(read(message))
+    def _keep_pose(self, message: PoseWithCovarianceStamped) -> None:
+        stamp_ns, pose, covariance = read_pose(message)
+        has_yaw = covariance[2, 2] < UNKNOWN_YAW_VARIANCE
+        self.poses['sfa_node'].append((stamp_ns, np.where([True, True, has_yaw], pose, np.nan)))
+        self.last_s = time.monotonic()
+
+    def _keep_odometry(self, message: Odometry) -> None:
+        stamp_ns, _, pose = read_odometry(message)
+        self.poses['ekf_node'].append((stamp_ns, np.array(pose)))
         self.last_s = time.monotonic()
 
     def _keep_state(self, message: String) -> None:
@@ -91,14 +96,14 @@ class Recorder:
     def spin(self, seconds: float) -> None:
         """Receive messages for some time."""
         end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            self._executor.spin_once(timeout_sec=left)
+        while (remaining := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=remaining)
 
     def connected(self) -> bool:
-        """True when every node of the chain has its publisher and its subscriptions."""
-        inputs = {'/odom': 0, 'panorama': 0, POSES['sfa_node']: 1}  # the recorder is another one
+        """Whether every node has its publisher and its subscriptions."""
+        inputs = {'/odom': 1, 'panorama': 1, POSES['sfa_node']: 2}  # one of two is the recorder
         return all(self._node.count_publishers(topic) for topic in POSES.values()) and all(
-            self._node.count_subscribers(topic) > own for topic, own in inputs.items()
+            self._node.count_subscribers(topic) >= count for topic, count in inputs.items()
         )
 
     def trajectory(self, name: str) -> Trajectory:
@@ -108,33 +113,27 @@ class Recorder:
         return Trajectory(stamps, np.array([pose for _, pose in poses]).reshape(-1, 3))
 
 
-def _pose(message: PoseWithCovarianceStamped) -> tuple[int, Array]:
-    stamp_ns, pose, covariance = read_pose(message)
-    known = covariance[2, 2] < KNOWN_YAW_VARIANCE
-    return stamp_ns, np.where([True, True, known], pose, np.nan)
-
-
-def _odometry(message: Odometry) -> tuple[int, Array]:
-    stamp_ns, _, pose = read_odometry(message)
-    return stamp_ns, np.array(pose)
-
-
 class Processes:
-    """Context manager of programs that write to log files; all have ended after its exit."""
+    """Context manager of programs with log files; on its exit all have ended."""
 
-    def __init__(self, folder: Path, stop_timeout_s: float) -> None:
+    def __init__(self, folder: Path, stop_timeout_s: float = STOP_S) -> None:
         self._folder, self._stop_timeout_s = folder, stop_timeout_s
         self._running: dict[str, Popen[bytes]] = {}
+        folder.mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> Processes:
-        self._folder.mkdir(parents=True, exist_ok=True)
         return self
 
     def __exit__(self, *_error: object) -> None:
         """Interrupt all, then terminate and finally kill those that do not end in time."""
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C leaves no program
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # also after a second Ctrl-C
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-            self._stop(number)
+            alive = [process for process in self._running.values() if process.poll() is None]
+            for process in alive:
+                process.send_signal(number)
+            for process in alive:
+                with suppress(TimeoutExpired):
+                    process.wait(self._stop_timeout_s)
         signal.signal(signal.SIGINT, before)
 
     def start(self, name: str, command: Sequence[str]) -> None:
@@ -143,11 +142,11 @@ class Processes:
             self._running[name] = Popen(command, stdin=DEVNULL, stdout=output, stderr=STDOUT)
 
     def log(self, name: str) -> Path:
-        """File with the output of a program."""
+        """The file with the output of a program."""
         return self._folder / f'{name}.log'
 
     def ended(self, name: str) -> bool:
-        """True after a program has ended with exit code 0. Raises NodeError for another."""
+        """Whether a program has ended, with exit code 0. Raises NodeError for another exit code."""
         code = self._running[name].poll()
         if code:
             how = f'exit code {code}' if code >= 0 else signal.Signals(-code).name
@@ -155,7 +154,7 @@ class Processes:
         return code is not None
 
     def require_alive(self, names: Sequence[str]) -> None:
-        """Raise NodeError, with the last lines of its output, for a program that has ended."""
+        """Raise NodeError with the last output of a program that has ended."""
         for name in names:
             if self.ended(name):
                 raise NodeError(f'{name} ended; {self._last_output(name)}')
@@ -164,14 +163,6 @@ class Processes:
         lines = self.log(name).read_text(encoding='utf-8', errors='replace').strip().splitlines()
         last = '\n  '.join(lines[-LAST_LINES:])
         return f'its last output, from {self.log(name)}:\n  {last}'
-
-    def _stop(self, number: signal.Signals) -> None:
-        alive = [process for process in self._running.values() if process.poll() is None]
-        for process in alive:
-            process.send_signal(number)
-        for process in alive:
-            with suppress(TimeoutExpired):
-                process.wait(self._stop_timeout_s)
 
 
 def commands(model: Path, bag: Path) -> dict[str, list[str]]:
@@ -184,10 +175,10 @@ def commands(model: Path, bag: Path) -> dict[str, list[str]]:
 
 
 def run_live(programs: Mapping[str, Sequence[str]], folder: Path) -> Live:
-    """Run the nodes, then the player; return what the nodes published.
+    """Run the nodes, then the player, and record the outputs of the nodes.
 
-    `programs` are command lines, see `commands`; logs go to `folder`. Raises NodeError when one
-    ends too early, does not start, or stays silent. All processes have ended on return.
+    `programs` are command lines, see `commands`; logs go to `folder`. Raises NodeError if a node
+    does not start, ends early or publishes nothing. On return all processes have ended.
     """
     domain_id = 1 + os.getpid() % LARGEST_DOMAIN
     os.environ.update(
@@ -196,7 +187,7 @@ def run_live(programs: Mapping[str, Sequence[str]], folder: Path) -> Live:
         ROS_LOG_DIR=str(folder.resolve() / 'ros'),
         PYTHONUNBUFFERED='1',
     )
-    with closing(Recorder(domain_id)) as recorder, Processes(folder, STOP_S) as processes:
+    with closing(Recorder(domain_id)) as recorder, Processes(folder) as processes:
         for name in NODES:
             processes.start(name, programs[name])
         _await_nodes(recorder, processes)

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Options made from the settings classes, settings made from options, and what commands share."""
+"""Options from settings classes, settings from options, and checks that commands share."""
 
 from __future__ import annotations
 
@@ -28,14 +28,13 @@ TOPIC_OPTIONS = {
     'points_topic': '--points-topic',
     'ground_truth': '--ground-truth-topic',
 }
-
 REPORT_FILES = ('.html', '.md', '.png')
-"""What a report writes into its folder."""
+"""Kinds of files in the folder of a report."""
 
 
 def require_output(output: Path, inputs: Iterable[Path | None], *suffixes: str) -> None:
-    """Raise LocalizationError where an output would replace an input, a file of an input bag, or a
-    file of another kind than these suffixes name.
+    """Raise LocalizationError if an output would replace an input or a file of an input bag, or if
+    it is a file without one of the suffixes.
     """
     from sfa_localization.bags.recording import recorded_files
 
@@ -44,8 +43,8 @@ def require_output(output: Path, inputs: Iterable[Path | None], *suffixes: str) 
 
 
 def require_kind(output: Path, *suffixes: str) -> None:
-    """Raise LocalizationError where an output would replace a file of another kind, by its name; of
-    a link, what it names counts.
+    """Raise LocalizationError if an output, or the target of a link, is a file without one of the
+    suffixes.
     """
     replaced = resolved(output)
     if first_bytes(replaced) and replaced.suffix.lower() not in suffixes:
@@ -54,15 +53,15 @@ def require_kind(output: Path, *suffixes: str) -> None:
 
 
 def require_new(output: Path) -> None:
-    """Raise LocalizationError where an output would replace what a user may have written."""
+    """Raise LocalizationError if an output would replace any file."""
     require_outputs([output], [])
     if first_bytes(output):
         raise LocalizationError(f'{output}: is there: give another name, or remove it')
 
 
 def require_report(folder: Path | None, other: Path | None) -> None:
-    """Raise LocalizationError before the work where a report cannot have its folder, or where it
-    would replace the other output, or files that no report has written.
+    """Raise LocalizationError if a report cannot have its folder, or would replace the other output
+    or files of the user.
     """
     if folder is None:
         return
@@ -84,7 +83,7 @@ def require_report(folder: Path | None, other: Path | None) -> None:
 def add_settings(
     parser: argparse.ArgumentParser, group: type[Settings], names: Sequence[str] = ()
 ) -> None:
-    """Add an option --some-name for each named setting of the group (none named: for all)."""
+    """Add an option --some-name for each named setting of the group, without names for all."""
     for item in dataclasses.fields(group):
         if names and item.name not in names:
             continue
@@ -96,7 +95,7 @@ def add_settings(
             type=numbers if isinstance(item.default, tuple) else type(item.default),
             choices=item.metadata['choices'] or None,
             default=argparse.SUPPRESS,
-            help=f'{item.metadata["doc"]}{unit} [{_shown(item.default)}]',
+            help=f'{item.metadata["doc"]}{unit} [{_text(item.default)}]',
         )
 
 
@@ -108,7 +107,7 @@ def numbers(text: str) -> tuple[float, ...]:
         raise argparse.ArgumentTypeError(f'{text!r} is not like 16x18') from None
 
 
-def _shown(default: object) -> str:
+def _text(default: object) -> str:
     return 'x'.join(f'{part:g}' for part in default) if isinstance(default, tuple) else str(default)
 
 
@@ -126,7 +125,7 @@ def add_topics(parser: argparse.ArgumentParser, *names: str) -> None:
 
 
 def destination(group: type[Settings], name: str) -> str:
-    """Return the parser's name of a setting, with its group: two groups may share a name."""
+    """Return the parser's name of a setting, which includes the group: names may repeat."""
     return f'{group.__name__}.{name}'
 
 
@@ -137,16 +136,16 @@ def given(group: type[Settings], arguments: argparse.Namespace) -> dict[str, Any
 
 
 def settings(group: type[S], arguments: argparse.Namespace) -> S:
-    """Return the group's settings: defaults, then the parameter file, then the command line."""
+    """Return the group's settings: the command line overrides the parameter file."""
     path = getattr(arguments, 'config', None)
     section = next((name for name, kinds in SECTIONS.items() if group in kinds), '')
     base = load_settings(path, section, group) if path and section else group()
-    from_file = {item.name: getattr(base, item.name) for item in dataclasses.fields(group)}
+    from_file = dataclasses.asdict(base)
     return group.from_mapping({**from_file, **given(group, arguments)}, 'command line')
 
 
 def recipe(arguments: argparse.Namespace) -> Recipe:
-    """Return the recipe of --config, with the topics and settings of the command line."""
+    """Return the training recipe of --config and of the command line."""
     from sfa_localization.training import Recipe
 
     default, chosen = Recipe(), {}
@@ -158,11 +157,11 @@ def recipe(arguments: argparse.Namespace) -> Recipe:
 
 
 def require_same_panorama(path: Path | None, trained: PanoramaConfig) -> None:
-    """Reject a parameter file with which sfa_node would reject the panoramas of omnicam_node."""
+    """Raise ConfigError for a parameter file with other panoramas than those of the training."""
     if path is None:
         return
     declared = load_settings(path, 'omnicam_node', PanoramaConfig)
-    # Images that are panoramas already keep their own size.
+    # Recorded panoramas keep their size.
     declared = dataclasses.replace(declared, width=trained.width, height=trained.height)
     differences = trained.differences(declared)
     if differences:

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Learn a place model from bags, or add what is new on later drives to one."""
+"""Learn a place model from bags, or extend a model by later drives."""
 
 from __future__ import annotations
 
@@ -36,14 +36,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--update',
         type=Path,
         metavar='MODEL',
-        help='instead of learning anew, add to this model what is new on the drives: images in '
-        'another light or season, where the robot was sure of its place',
+        help='extend this model by images of new viewpoints, light or seasons, instead of training',
     )
     parser.add_argument('--config', type=Path, help='parameter file')
     parser.add_argument('--report', type=Path, metavar='DIR', help='write figures of the training')
     parser.add_argument('--resume', action='store_true', help='continue an interrupted training')
     parser.add_argument('--strict', action='store_true', help='reject damaged bags')
-    parser.add_argument('--force', action='store_true', help='train on what contradicts itself too')
+    parser.add_argument('--force', action='store_true', help='train also on contradictory motion')
     options.add_topics(parser, 'image', 'odometry', 'imu', 'points_topic')
     options.add_settings(parser, SegmentConfig, ('segments',))
     options.add_settings(parser, MetricConfig, ('solver', 'metric_map', 'points'))
@@ -77,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _update(arguments: argparse.Namespace) -> int:
-    """Extend a model; say what was added."""
+    """Extend a model; print what was added."""
     unused = [name for name in ('report', 'resume', 'force') if getattr(arguments, name)]
     for group in (SegmentConfig, MetricConfig, NetworkConfig):
         unused += options.given(group, arguments)
@@ -105,7 +104,7 @@ def _update(arguments: argparse.Namespace) -> int:
 
 
 def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Recipe) -> None:
-    """Write figures and the page, with the worst images read from the bags once more."""
+    """Write figures and the page; the worst images are read from the bags again."""
     from sfa_localization.bags.drives import images_at
     from sfa_localization.reports.page import PAGE, begin_page
     from sfa_localization.reports.training import worst_of, write_training_report
@@ -115,7 +114,7 @@ def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Re
         images_at(bag, [stamp for run, stamp in worst.values() if run == number], used)
         for number, bag in enumerate(bags)
     ]
-    samples = {one: read[run][at] for one, (run, at) in worst.items() if at in read[run]}
+    samples = {image: read[run][at] for image, (run, at) in worst.items() if at in read[run]}
     begin_page(folder)
     write_training_report(folder, trained, samples)
     print(f'{folder / PAGE}: written')

@@ -13,13 +13,14 @@ from sfa_localization.commands import options
 from sfa_localization.config import load_changes, write_config
 from sfa_localization.fusion.settings import FilterConfig
 
-WRITES = 'a parameter file with the noise parameters that were found'
+WRITES = 'a parameter file with the tuned noise parameters'
 EXAMPLES = """\
   tune bags/test --model model.npz --output tuned.yaml
   tune bags/a bags/b --model model.npz --method grid --output tuned.yaml
 
 The default method needs no ground truth; grid, the search of the paper, does. Variances are in
-m^2, rad^2, (m/s)^2 and (rad/s)^2. `evaluate --config tuned.yaml` judges it on another drive."""
+m^2, rad^2, (m/s)^2 and (rad/s)^2. Check the result on another
+drive by `evaluate --config tuned.yaml`."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,10 +50,10 @@ def run(arguments: argparse.Namespace) -> int:
     drives = [tuning.read_drive(bag, model, reading, watch, grid) for bag in arguments.bags]
     best = search(drives, config)
     before, after = asdict(config), asdict(best)
-    found = {name: value for name, value in after.items() if value != before[name]}
-    changes.setdefault('ekf_node', {}).update(found)
+    tuned = {name: value for name, value in after.items() if value != before[name]}
+    changes.setdefault('ekf_node', {}).update(tuned)
     write_config(arguments.output, changes)
-    for name, value in found.items():
+    for name, value in tuned.items():
         print(f'{name}: {value:.4g} (was {before[name]:.4g})')
     unit = 'm mean error' if grid else 'negative log-likelihood'
     print(f'{arguments.output}: {cost(drives, best):.4f} {unit}, before {cost(drives, config):.4f}')

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page of bags: enough or not, what to drive next, what is in them, path and images."""
+"""The page of bags: whether they suffice, what to drive next, contents, path and images."""
 
 from __future__ import annotations
 
@@ -34,35 +34,33 @@ def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
 
 
 def bag_sections(
-    found: Mapping[str, Any], facts: Sequence[str], shown: Mapping[Path, str]
+    report: Mapping[str, Any], facts: Sequence[str], figures: Mapping[Path, str]
 ) -> list[str]:
-    """The sections of a page about a bag. Raises LocalizationError.
-
-    `found` are the findings as plain values, `facts` sentences about images, drive and clocks,
-    `shown` figures with their captions.
+    """The sections of a page about a bag: `report` as plain values, `facts` as sentences, and
+    `figures` with captions. Raises LocalizationError.
     """
-    enough = found['enough_to_train_on']
+    enough = report['enough_to_train_on']
     answer = 'is enough to train on.' if enough else 'is not enough to train on yet.'
-    lacks = [found['error']] if found['error'] else found['lacks']
-    topics = found['topics'].items()
+    lacks = [report['error']] if report['error'] else report['lacks']
+    topics = report['topics'].items()
     rows = [[name, str(t['count']), f'{t["rate_hz"]:.1f}', f'{t["largest_gap_s"]:.1f}']
             for name, t in topics]  # fmt: skip
     damage = [f'{name}: {problem}' for name, t in topics for problem in t['problems']]
     head = ('topic', 'messages', 'Hz', 'longest pause (s)')
     return [
-        page.verdict(page.GOOD if enough else page.BAD, f'{Path(found["path"]).name} {answer}'),
+        page.verdict(page.GOOD if enough else page.BAD, f'{Path(report["path"]).name} {answer}'),
         page.section('What do I drive or change next?', page.items(lacks)),
         page.section('What is in it?', page.items(facts), page.table(head, rows) if rows else ''),
-        motion_section(found['motion']) if found['motion'] else '',
-        page.section('What is damaged?', page.items([*found['problems'], *damage])),
-        page.section('Path and images', *(page.figure(*one) for one in shown.items())),
-        page.section('Notes', page.items(found['notes'])),
+        motion_section(report['motion']) if report['motion'] else '',
+        page.section('What is damaged?', page.items([*report['problems'], *damage])),
+        page.section('Path and images', *(page.figure(*item) for item in figures.items())),
+        page.section('Notes', page.items(report['notes'])),
     ]
 
 
-def motion_section(found: Mapping[str, Any]) -> str:
-    """The section about the sources of motion, of the plain values of a `MotionCheck`."""
-    pairs = [[*row.values()] for row in found['pairs']]
-    table = page.table([*found['pairs'][0]], pairs) if pairs else ''
-    said = page.items([*found['wrong'], *found['corrected'], *found['notes']])
-    return page.section('Do images, odometry and gyroscope agree?', said, table)
+def motion_section(check: Mapping[str, Any]) -> str:
+    """The section about the sources of motion, from the plain values of a `MotionCheck`."""
+    rows = [[*pair.values()] for pair in check['pairs']]
+    table = page.table([*check['pairs'][0]], rows) if rows else ''
+    sentences = page.items([*check['wrong'], *check['corrected'], *check['notes']])
+    return page.section('Do images, odometry and gyroscope agree?', sentences, table)

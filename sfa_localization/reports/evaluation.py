@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures, tables and page of an evaluation: how far off, where, was the robot sure and wrong.
+"""Figures, tables and page of an evaluation: errors, their places, and covariances.
 
 Trajectories are in the frame of the ground truth. The colors are those of Okabe and Ito for
 color-blind readers.
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -48,66 +48,52 @@ STYLES: dict[str, dict[str, Any]] = {
 }
 OTHER: dict[str, Any] = {'color': '#CC79A7', 'linestyle': '-', 'linewidth': 1.2}
 TRUTH: dict[str, Any] = {'color': '0.72', 'linewidth': 5.0, 'solid_capstyle': 'round', 'zorder': 1}
-MAPS_SHOWN = 8
-"""Firing maps in one figure: the slowest features carry the place."""
+FIRING_MAPS = 8
+"""Firing maps in a figure, those of the slowest features."""
 FEATURE_LIMIT = 2.0
-"""Standard deviations at which the colors saturate; slow features have unit variance."""
+"""Value at which the colors saturate; slow features have unit variance."""
 MARGIN_M = 0.5
 """Margin around the paths (m)."""
 TRUSTED_SHARE = 0.8
-"""Of the true positions, the filter's regions of 95 % hold at least so many where they can be
-believed: errors of neighboring images are alike, so one bad corner moves the share."""
-_WEAK = 2.0  # times the mean error: places that are clearly worse than usual
+"""Share of true positions in the filter's 95 % regions below which its covariances are too small;
+errors of neighboring images are correlated, so the share varies."""
+_WEAK = 2.0  # times the mean error, from which a place counts as weak
 
 
-def position_errors(truth: Trajectory, estimate: Trajectory) -> tuple[Array, Array]:
-    """Seconds since the truth's start (M,) and Euclidean errors in meters (M,).
-
-    Estimates at stamps without ground truth are left out.
+class Errors(NamedTuple):
+    """Errors of the estimates that the truth covers: position (M,) m, and heading (M,) degrees, NaN
+    without a heading; with stamps (M,), seconds (M,) since the truth's start, places (M, 2) m.
     """
-    stamps, _, errors = _errors(truth, estimate)
-    return (stamps - truth.stamps_ns[0]) * 1e-9, errors
+
+    stamps_ns: Stamps
+    seconds: Array
+    places: Array
+    position_m: Array
+    heading_deg: Array
 
 
-def heading_errors(truth: Trajectory, estimate: Trajectory) -> tuple[Array, Array]:
-    """Seconds since the truth's start (M,) and signed heading errors in degrees (M,).
-
-    Estimates without a heading (NaN) or without ground truth are left out.
-    """
-    kept = truth.covers(estimate.stamps_ns) & np.isfinite(estimate.poses[:, 2])
-    stamps = estimate.stamps_ns[kept]
-    offset = wrap_angle(estimate.poses[kept, 2] - truth.at(stamps)[:, 2])
-    return (stamps - truth.stamps_ns[0]) * 1e-9, np.degrees(offset)
-
-
-def _errors(truth: Trajectory, estimate: Trajectory) -> tuple[Stamps, Array, Array]:
-    """Stamps (M,), true places (M, 2) and position errors (M,) m where the truth is known."""
-    kept = truth.covers(estimate.stamps_ns)
-    places = truth.at(estimate.stamps_ns[kept])[:, :2]
-    errors = np.asarray(np.hypot(*(estimate.poses[kept, :2] - places).T))
-    return estimate.stamps_ns[kept], places, errors
+def errors_of(truth: Trajectory, estimate: Trajectory) -> Errors:
+    """The errors of an estimate."""
+    mask = truth.covers(estimate.stamps_ns)
+    stamps = estimate.stamps_ns[mask]
+    true = truth.at(stamps)
+    x, y, yaw = (estimate.poses[mask] - true).T
+    seconds = (stamps - truth.stamps_ns[0]) * 1e-9
+    return Errors(stamps, seconds, true[:, :2], np.hypot(x, y), np.degrees(wrap_angle(yaw)))
 
 
-def table(scores: Scores) -> str:
-    """Position errors in meters, one line per estimate, as a Markdown table."""
-    return _markdown(*_position_rows(scores))
+def tables(scores: Scores) -> str:
+    """Position and heading errors as Markdown tables."""
+    return '\n\n'.join(_markdown(*rows(scores)) for rows in (_position_rows, _heading_rows))
 
 
-def heading_table(scores: Scores) -> str:
-    """Heading errors in degrees, one line per estimate that has a heading."""
-    return _markdown(*_heading_rows(scores))
-
-
-Rows = tuple[list[str], list[list[str]]]
-
-
-def _position_rows(scores: Scores) -> Rows:
-    rows = [[_label(n), *(number(one[c], c) for c in COLUMNS)] for n, one in scores.items()]
+def _position_rows(scores: Scores) -> tuple[list[str], list[list[str]]]:
+    rows = [[_label(n), *(number(row[c], c) for c in COLUMNS)] for n, row in scores.items()]
     return ['position error (m)', *COLUMNS], rows
 
 
-def _heading_rows(scores: Scores) -> Rows:
-    errors = {name: one['yaw_deg'] for name, one in scores.items() if one.get('yaw_deg')}
+def _heading_rows(scores: Scores) -> tuple[list[str], list[list[str]]]:
+    errors = {name: yaw for name, row in scores.items() if (yaw := row.get('yaw_deg'))}
     rows = [[_label(n), *(f'{yaw[c]:.2f}' for c in YAW_COLUMNS)] for n, yaw in errors.items()]
     return ['heading error (degrees)', *YAW_COLUMNS], rows
 
@@ -124,7 +110,7 @@ def _label(name: str) -> str:
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table with padded columns, so that it is readable as plain text too."""
+    """A table with padded columns, readable as plain text."""
     first = max(len(row[0]) for row in (head, *rows))
     width = max(len(cell) for row in (head, *rows) for cell in row[1:])
     lines = [
@@ -136,21 +122,19 @@ def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def trust_lines(scores: Scores) -> list[str]:
-    """Whether the covariances are right, and the errors left after a similarity alignment on the
-    drive itself; of the estimates that have these scores.
-    """
+    """Calibration of the covariances, and errors after alignment by a similarity."""
     lines = []
-    for name, one in scores.items():
-        shares = {'positions': one.get('within_95'), 'headings': one.get('yaw_within_95')}
-        held = [f'{100 * share:.1f} % of {of}' for of, share in shares.items() if share]
-        parts = [f'regions of 95 % hold {" and ".join(held)}'] if held else []
-        if one.get('nees') is not None:
-            low, high = one['nees_right']
+    for name, row in scores.items():
+        shares = {'positions': row.get('within_95'), 'headings': row.get('yaw_within_95')}
+        inside = [f'{100 * share:.1f} % of {of}' for of, share in shares.items() if share]
+        parts = [f'regions of 95 % hold {" and ".join(inside)}'] if inside else []
+        if row.get('nees') is not None:
+            low, high = row['nees_right']
             parts.append(
-                f'squared errors are {one["nees"]:.2f} times the expected ones '
+                f'squared errors are {row["nees"]:.2f} times the expected ones '
                 f'(on such a drive {low:.2f} to {high:.2f} where covariances are right)'
             )
-        best = one.get('similarity') or {}
+        best = row.get('similarity') or {}
         if best.get('mean') is not None:
             parts.append(f'scaled by {best["scale"]:.4f} it errs by {best["mean"]:.3f} m')
         if parts:
@@ -166,12 +150,19 @@ def write_report(
     positions: Array,
     features: Array,
 ) -> None:
-    """Write the figures overview.png and errors.png into `folder`, created when missing.
+    """Write overview.png, with paths, errors and firing maps, and errors.png into `folder`.
 
-    Estimates are in the truth's frame; `positions` (N, 2) m and `features` (N, K) belong together.
-    Raises LocalizationError when a file cannot be written.
+    Estimates are in the truth's frame; firing maps show `features` (N, K) at `positions` (N, 2) m.
+    Raises LocalizationError.
     """
-    overview_figure(folder / 'overview.png', truth, estimates, scores, positions, features)
+    figure = Figure(figsize=(13.0, 6.2), layout='constrained')
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.2)).flat
+    _draw_paths(left.add_subplot(), truth, estimates, scores)
+    upper, lower = right.subfigures(2, 1, squeeze=False, height_ratios=(0.8, 1.0)).flat
+    row = upper.subplots(1, 4, sharey=True, squeeze=False)[0]
+    _draw_firing_maps(upper, row, positions, features)
+    _draw_position_errors(lower.add_subplot(), truth, estimates)
+    save(figure, folder / 'overview.png')
     errors_figure(folder / 'errors.png', truth, estimates)
 
 
@@ -181,7 +172,8 @@ def errors_figure(path: Path, truth: Trajectory, estimates: Estimates) -> None:
     upper, lower = figure.subplots(2, 1, sharex=True)
     _draw_position_errors(upper, truth, estimates)
     for name, estimate in estimates.items():
-        lower.plot(*heading_errors(truth, estimate), **STYLES.get(name, OTHER))
+        errors = errors_of(truth, estimate)
+        lower.plot(errors.seconds, errors.heading_deg, **STYLES.get(name, OTHER))
     lower.axhline(0.0, color='0.4', linewidth=0.8)
     lower.set(xlabel='time (s)', ylabel='heading error (°)', xlim=(0, None))
     lower.grid(alpha=0.3)
@@ -195,27 +187,8 @@ def firing_maps_figure(path: Path, positions: Array, features: Array) -> None:
     `positions` (N, 2) of the images in meters; `features` (N, K).
     """
     figure = Figure(figsize=(12.0, 6.2), layout='compressed')
-    grid = figure.subplots(2, MAPS_SHOWN // 2, sharex=True, sharey=True, squeeze=False)
+    grid = figure.subplots(2, FIRING_MAPS // 2, sharex=True, sharey=True, squeeze=False)
     _draw_firing_maps(figure, list(grid.flat), positions, features)
-    save(figure, path)
-
-
-def overview_figure(
-    path: Path,
-    truth: Trajectory,
-    estimates: Estimates,
-    scores: Scores,
-    positions: Array,
-    features: Array,
-) -> None:
-    """Draw paths, errors and firing maps of `features` (N, K) at `positions` (N, 2) m in one."""
-    figure = Figure(figsize=(13.0, 6.2), layout='constrained')
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.2)).flat
-    _draw_paths(left.add_subplot(), truth, estimates, scores)
-    upper, lower = right.subfigures(2, 1, squeeze=False, height_ratios=(0.8, 1.0)).flat
-    row = upper.subplots(1, 4, sharey=True, squeeze=False)[0]
-    _draw_firing_maps(upper, row, positions, features)
-    _draw_position_errors(lower.add_subplot(), truth, estimates)
     save(figure, path)
 
 
@@ -235,7 +208,8 @@ def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Sco
 
 def _draw_position_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -> None:
     for name, estimate in estimates.items():
-        axes.plot(*position_errors(truth, estimate), label=_label(name), **STYLES.get(name, OTHER))
+        errors, style = errors_of(truth, estimate), STYLES.get(name, OTHER)
+        axes.plot(errors.seconds, errors.position_m, label=_label(name), **style)
     axes.set(xlabel='time (s)', ylabel='position error (m)', xlim=(0, None), ylim=(0, None))
     axes.grid(alpha=0.3)
     if estimates:
@@ -267,11 +241,11 @@ def _draw_firing_maps(
 
 
 def _bulk(estimate: Trajectory) -> Array:
-    """Corners (2, 3) of an estimate without its outermost percents, which need not be seen."""
-    known = estimate.poses[np.isfinite(estimate.poses).all(1)]
-    if not len(known):
-        return known
-    low, high = np.percentile(known[:, :2], (1.0, 99.0), axis=0)
+    """Corners (2, 3) of an estimate without outliers, between its percentiles 1 and 99."""
+    poses = estimate.poses[np.isfinite(estimate.poses).all(1)]
+    if not len(poses):
+        return poses
+    low, high = np.percentile(poses[:, :2], (1.0, 99.0), axis=0)
     return np.pad(np.stack([low, high]), ((0, 0), (0, 1)))
 
 
@@ -288,8 +262,9 @@ def _frame_view(axes: Axes, points: Array) -> None:
 
 def worst_of(truth: Trajectory, estimate: Trajectory) -> dict[WorstImage, int]:
     """The images whose positions are farthest from the truth, and their stamps."""
-    stamps, places, errors = _errors(truth, estimate)
-    return {one: int(stamps[one.row]) for one in worst_images(places, errors)}
+    errors = errors_of(truth, estimate)
+    worst = worst_images(errors.places, errors.position_m)
+    return {image: int(errors.stamps_ns[image.row]) for image in worst}
 
 
 def write_evaluation_page(
@@ -301,7 +276,7 @@ def write_evaluation_page(
     counts: Mapping[str, Any],
     samples: Mapping[WorstImage, Image],
 ) -> None:
-    """Write `folder`/index.html from the figures of `write_report`, and an error map.
+    """Write `folder`/index.html with the figures of `write_report` and an error map.
 
     `counts` are those of Evaluation, `samples` the worst images. Raises LocalizationError.
     """
@@ -318,73 +293,81 @@ def write_evaluation_page(
                                  'where the images seem to be taken, and errors')),
         page.section('Where is it weak?', page.items([*_weak_lines(truth, estimates['ekf'])]),
                      page.figure(folder / 'error_map.png', 'Error of the filter along the path')),
-        page.section('May I trust it?', page.items([*_trust(scores, counts)]),
+        page.section('May I trust it?', page.items(trust_lines(scores)),
                      page.figure(folder / 'errors.png', 'Errors over time')),
-        page.section('What was rejected?', page.items([*_rejected(counts)])),
+        page.section('What was rejected?', page.items(count_lines(counts))),
         page.section('Worst images', page.figure(folder / 'worst_images.png', 'Single images with '
                      'the largest errors, and where they were taken')) if samples else '',
     )  # fmt: skip
 
 
 def judgment(scores: Scores, counts: Mapping[str, Any]) -> tuple[str, str]:
-    """The color of the page, and its answer in a sentence."""
+    """The grade of an evaluation, and a sentence about it."""
     mean, wheels = scores['ekf']['mean'], scores['odometry']['mean']
     if mean is None:
         return page.BAD, 'The filter did not start, or the truth covers none of its estimates.'
     if counts['false_localised_s'] > 0:
         seconds = f'{counts["false_localised_s"]:.1f} s'
-        return page.BAD, f'For {seconds} the robot was sure and more than a meter off.'
+        return page.BAD, f'For {seconds} the filter was LOCALISED and more than a meter off.'
     if wheels is not None and mean > wheels:
-        return page.WEAK, f'The filter errs by {mean:.2f} m: more than the wheels alone.'
-    held = scores['ekf'].get('within_95')
-    if held is not None and held < TRUSTED_SHARE:
-        return page.WEAK, f'The filter errs by {mean:.2f} m, but is surer than it should be.'
-    return page.GOOD, f'The filter errs by {mean:.2f} m on average, and says how sure it is.'
+        return (
+            page.WEAK,
+            f'The mean error is {mean:.2f} m, more than that of the wheels alone.',
+        )
+    share = scores['ekf'].get('within_95')
+    if share is not None and share < TRUSTED_SHARE:
+        return (
+            page.WEAK,
+            f'The mean error is {mean:.2f} m, but the covariances are too small.',
+        )
+    return (
+        page.GOOD,
+        f'The mean error is {mean:.2f} m, and the covariances are right.',
+    )
 
 
 def error_map_figure(path: Path, truth: Trajectory, estimate: Trajectory) -> None:
     """Draw the true path colored by the position error (m) of an estimate."""
     figure = Figure(figsize=(7.0, 6.0), layout='constrained')
     axes = figure.add_subplot()
-    _, places, errors = _errors(truth, estimate)
-    top = max(float(np.percentile(errors, 98)), 0.05) if len(errors) else 1.0
-    dots = axes.scatter(
-        places[:, 0], places[:, 1], c=errors, s=14, cmap='viridis', vmin=0.0, vmax=top
-    )
+    errors = errors_of(truth, estimate)
+    top = max(float(np.percentile(errors.position_m, 98)), 0.05) if len(errors.places) else 1.0
+    x, y = errors.places.T
+    dots = axes.scatter(x, y, c=errors.position_m, s=14, cmap='viridis', vmin=0.0, vmax=top)
     figure.colorbar(dots, label='position error (m)', shrink=0.85, extend='max')
     in_meters(axes, 'Position error of the filter')
     save(figure, path)
 
 
 def _weak_lines(truth: Trajectory, estimate: Trajectory) -> Iterator[str]:
-    """Where the filter is worst: what to drive again in a further training drive."""
-    _, places, errors = _errors(truth, estimate)
+    """Where the errors of the filter are largest, and the remedy."""
+    _, _, places, errors, _ = errors_of(truth, estimate)
     if not len(errors):
         return
-    worst = worst_images(places, errors)
-    found = [one for one in worst if one.error_m > _WEAK * errors.mean()]
-    for one in found[:3]:
-        yield f'near x {one.x_m:.1f} m, y {one.y_m:.1f} m of the ground truth: {one.error_m:.2f} m'
-    if found:
+    worst = [k for k in worst_images(places, errors) if k.error_m > _WEAK * errors.mean()]
+    for k in worst[:3]:
+        yield f'near x {k.x_m:.1f} m, y {k.y_m:.1f} m of the ground truth: {k.error_m:.2f} m'
+    if worst:
         yield 'Drive there in a further training drive, in two directions.'
     else:
         yield f'Nowhere is the error more than {_WEAK:g} times its mean.'
 
 
-def _trust(scores: Scores, counts: Mapping[str, Any]) -> Iterator[str]:
-    yield from trust_lines(scores)
-    total = sum(counts['states_s'].values())
-    for name, seconds in counts['states_s'].items():
-        yield f'{name}: {seconds / max(total, 1e-9):.0%} of the drive'
-    yield f'LOCALISED and more than a meter off: {counts["false_localised_s"]:.1f} s'
-
-
-def _rejected(counts: Mapping[str, Any]) -> Iterator[str]:
-    """What was not used, and why: of the inputs, and by the filter."""
+def count_lines(counts: Mapping[str, Any]) -> list[str]:
+    """Used and skipped inputs, rejections of the filter, seconds in each state, camera delay."""
+    lines = []
     for stream in ('images', 'odometry', 'observations'):
-        for reason, n in sorted(counts[stream]['skipped'].items()):
-            yield f'{n} {stream}: {reason}'
-    used = {'odometry: used', 'measurement: accepted', 'measurement: started'}
-    for reason, n in sorted(counts['fusion'].items()):
-        if reason not in used:
-            yield f'{n} times {reason}'
+        skipped = sorted(counts[stream]['skipped'].items())
+        reasons = ''.join(f'; {n} skipped: {reason}' for reason, n in skipped)
+        lines.append(f'{stream}: {counts[stream]["used"]} used{reasons}')
+    usual = 'odometry: used', 'measurement: accepted', 'measurement: started'
+    rejected = sorted((why, n) for why, n in counts['fusion'].items() if why not in usual)
+    lines += [f'filter: {n} times {reason}' for reason, n in rejected]
+    states = ', '.join(f'{name} {seconds:.1f} s' for name, seconds in counts['states_s'].items())
+    lines.append(f'state: {states}')
+    if (wrong := counts['false_localised_s']) > 0:
+        lines.append(f'state: LOCALISED for {wrong:.1f} s with an error of more than a meter')
+    if (delay := counts.get('camera_delay_s')) is not None:
+        late = 'late' if delay > 0 else 'early'
+        lines.append(f'camera: images are stamped {abs(delay):.2f} s {late}')
+    return lines

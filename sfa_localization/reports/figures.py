@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the figures of all reports share: files, axes in meters, contact sheets, worst images."""
+"""Functions for the figures of all reports: files, axes, contact sheets, worst images."""
 
 from __future__ import annotations
 
@@ -18,9 +18,7 @@ from sfa_localization.data.rejections import encodable
 from sfa_localization.data.run import Image
 
 DOTS_PER_INCH = 130
-"""Resolution of the figures: sharp on a screen, and still small files."""
-WORST_IMAGES, WORST_APART_M = 6, 1.0
-"""Worst images shown, and the distance (m) between them: neighbors look alike."""
+"""Resolution of the figures: sharp on a screen, in small files."""
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -36,12 +34,12 @@ def save_text(path: Path, text: str) -> None:
 
 
 def as_title(text: str) -> str:
-    """A text with names of files or topics, as matplotlib draws it: a dollar starts no formula."""
+    """A text for matplotlib, in which a dollar does not start a formula."""
     return encodable(text).replace('$', r'\$')
 
 
 def in_meters(axes: Axes, title: str, frame: str = '') -> None:
-    """Equal axes x and y in meters, of a frame where that is not clear."""
+    """Equal axes x and y in meters, with the name of a frame if needed."""
     axes.set_aspect('equal', adjustable='datalim')
     axes.set(xlabel=f'x{frame} (m)', ylabel=f'y{frame} (m)')
     axes.set_title(as_title(title), fontsize=10)
@@ -57,15 +55,19 @@ class WorstImage(NamedTuple):
     row: int
 
 
-def worst_images(places: Array, errors: Array) -> list[WorstImage]:
-    """The images with the largest errors (M,) m, each apart from the others by places (M, 2) m."""
-    left, found = np.ones(len(errors), bool), list[WorstImage]()
-    while left.any() and len(found) < WORST_IMAGES:
-        row = int(np.argmax(np.where(left, errors, -np.inf)))
+def worst_images(
+    places: Array, errors: Array, count: int = 6, distance_m: float = 1.0
+) -> list[WorstImage]:
+    """The images at places (M, 2) m with the largest errors (M,) m, `distance_m` or more from each
+    other.
+    """
+    rest, worst = np.ones(len(errors), bool), list[WorstImage]()
+    while rest.any() and len(worst) < count:
+        row = int(np.argmax(np.where(rest, errors, -np.inf)))
         x, y = places[row].tolist()
-        found.append(WorstImage(x, y, float(errors[row]), row))
-        left &= np.hypot(*(places - places[row]).T) >= WORST_APART_M
-    return found
+        worst.append(WorstImage(x, y, float(errors[row]), row))
+        rest &= np.hypot(*(places - places[row]).T) >= distance_m
+    return worst
 
 
 def write_worst_images(path: Path, samples: Mapping[WorstImage, Image]) -> None:

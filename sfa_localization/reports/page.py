@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""One self-contained HTML page: figures are part of the file, nothing is loaded, no script runs."""
+"""A self-contained HTML page: figures are part of the file, and there are no scripts."""
 
 from __future__ import annotations
 
@@ -78,8 +78,8 @@ def section(title: str, *parts: str) -> str:
 
 
 def begin_page(folder: Path) -> None:
-    """Mark a folder as that of a report before its figures are written: one that is interrupted is
-    replaced by the next.
+    """Mark a folder as a report before its figures are written, so that the next run may replace
+    an interrupted report.
     """
     write_page(folder, 'Unfinished report: it was interrupted; run the command again')
 

@@ -13,17 +13,17 @@ from sfa_localization.training import Trained
 
 GOOD, WEAK, BAD = 'good', 'weak', 'bad'
 GOOD_M, USEFUL_M, GOOD_DEG = 0.5, 2.0, 11.5
-"""Expected errors of one image at which the filter's default limits make a state DEGRADED, and LOST
-(m), and DEGRADED by its heading (degrees)."""
+"""Expected errors of an image at which a filter with default limits is DEGRADED and LOST (m), and
+DEGRADED by its heading (degrees)."""
 TRUSTED_SHARE = 0.9
-"""Of the left-out images, the regions of 95 % hold at least so many where they can be believed."""
+"""Share of left-out images in their 95 % regions below which covariances are too small."""
 EXPLAINED = 0.5
-"""Share of the places' spread that features explain in images left out: below, knowing no image is
-nearly as good."""
+"""Share of the variance of places that the features explain in left-out images; with less, the
+images are almost useless."""
 
 
 def summary(trained: Trained) -> str:
-    """Amount of data, certificate, expected errors, and what was skipped; without ground truth."""
+    """Amount of data, certificate, expected errors, and skipped data, without ground truth."""
     quality = trained.model.quality
     coverage = quality['coverage']
     worst = quality['worst']
@@ -61,7 +61,7 @@ def summary(trained: Trained) -> str:
 
 
 def judgment(trained: Trained) -> tuple[str, str]:
-    """The color of the page, and its answer in a sentence."""
+    """The grade of a map, and a sentence about it."""
     quality = trained.model.quality
     expected = quality['expected_error_m']
     by_map = [pair for check in trained.checks for pair in check.pairs if pair.b == MAP]
@@ -72,11 +72,11 @@ def judgment(trained: Trained) -> tuple[str, str]:
         return BAD, 'The map cannot be used: the images hardly show where they were taken.'
     if expected > USEFUL_M:
         return BAD, 'The map cannot be used yet: see what to drive next.'
-    sure = quality['certified'] and quality['left_out_within_95'] >= TRUSTED_SHARE
+    trusted = quality['certified'] and quality['left_out_within_95'] >= TRUSTED_SHARE
     care = too_sparse(trained.metric.poses, InspectionConfig().max_spacing)
     if quality.get('expected_yaw_error_deg', 0.0) > GOOD_DEG:
         care.append('images look alike from several headings, and perhaps places')
-    if expected > GOOD_M or not sure:
+    if expected > GOOD_M or not trusted:
         care.append('see where it is weak')
     if care:
         return WEAK, f'The map can be used with care: {"; ".join(care)}.'
@@ -84,11 +84,9 @@ def judgment(trained: Trained) -> tuple[str, str]:
 
 
 def point_lines(quality: Mapping[str, Any]) -> list[str]:
-    """By how much the map misses each measured point."""
-    if 'points' not in quality:
-        return []
+    """The error of the map at each measured point."""
     return [
-        f'{one["name"]}: x {one["x_m"]:.2f} m, y {one["y_m"]:.2f} m: missed by '
-        f'{one["miss_m"]:.3f} m' + ('' if one['used'] else ', left out')
-        for one in quality['points']
+        f'{point["name"]}: x {point["x_m"]:.2f} m, y {point["y_m"]:.2f} m: missed by '
+        f'{point["miss_m"]:.3f} m' + ('' if point['used'] else ', left out')
+        for point in quality.get('points', ())
     ]

@@ -1,10 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a training: is the map good, where is it weak, may I trust it, what to drive next."""
+"""The page of a training: the map, its weak places and calibration, and what to drive next."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +22,10 @@ from sfa_localization.reports.summary import judgment, summary
 from sfa_localization.training import Trained
 
 FEW_CROSSINGS = 5
-"""With fewer crossings one bad stretch of odometry bends the map unnoticed."""
+"""With fewer crossings, a bad stretch of odometry bends the map unnoticed."""
 PARALLEL = 0.3
 """Spread of driving directions (0 parallel, 1 even) below which the drive was one-sided."""
-_PLACES, _APART_M = 3, 2.0  # weak places named, and the distance between them (m)
-_WEAK = 1.5  # times the expected error: ground that is clearly worse than usual
+_WEAK = 1.5  # times the expected error, from which a place counts as weak
 _CAPTIONS = {
     'coverage': 'Where images were taken (black), on the expected error of one image',
     'line_fits': 'Each segment by odometry (wide) and by slow features (thin)',
@@ -36,7 +35,7 @@ _CAPTIONS = {
 
 
 def worst_of(trained: Trained) -> dict[WorstImage, tuple[int, int]]:
-    """The images that the map puts farthest from where their segment does: run and stamp."""
+    """Run and stamp of the images with the largest distance between map and segment."""
     images, places = trained.metric.images, trained.metric.poses[:, :2]
     stamps = [
         (number, stamp)
@@ -44,16 +43,15 @@ def worst_of(trained: Trained) -> dict[WorstImage, tuple[int, int]]:
         for stamp in run.panoramas.stamps_ns.tolist()
     ]
     worst = figures.worst_images(places, np.hypot(*trained.metric.residuals.T))
-    return {one: stamps[images[one.row]] for one in worst}
+    return {image: stamps[images[image.row]] for image in worst}
 
 
 def write_training_report(
     folder: Path, trained: Trained, samples: Mapping[WorstImage, Image] | None = None
 ) -> None:
-    """Write figures of the training, and the page index.html that contains them all.
+    """Write figures of the training, with `samples` of the worst images, and index.html.
 
-    The `samples` of the worst images too, where there are any. Makes the folder. Raises
-    LocalizationError when a file cannot be written.
+    Raises LocalizationError if a file cannot be written.
     """
     images, places = trained.metric.images, trained.metric.poses[:, :2]
     coverage_figure(folder / 'coverage.png', trained, places)
@@ -78,16 +76,10 @@ def write_training_report(
     )  # fmt: skip
 
 
-def weak_places(forecast: Forecast) -> Iterator[tuple[float, float, float]]:
-    """x, y (m) and expected error (m) where it is largest, each apart from the others."""
-    local, points = forecast.local, forecast.places
-    left = np.ones(len(points), bool)
-    for _ in range(_PLACES):
-        at = int(np.argmax(np.where(left, local, -np.inf)))
-        if not left[at] or local[at] < _WEAK * forecast.expected_m:
-            return
-        yield float(points[at, 0]), float(points[at, 1]), float(local[at])
-        left &= np.hypot(*(points - points[at]).T) > _APART_M
+def weak_places(forecast: Forecast) -> list[WorstImage]:
+    """Up to three places with the largest expected error."""
+    worst = figures.worst_images(forecast.places, forecast.local, 3, 2.0)
+    return [place for place in worst if place.error_m >= _WEAK * forecast.expected_m]
 
 
 def weak_lines(trained: Trained) -> list[str]:
@@ -95,7 +87,7 @@ def weak_lines(trained: Trained) -> list[str]:
     forecast = trained.metric.forecast
     share = float((forecast.local > _WEAK * forecast.expected_m).mean())
     lines = [
-        f'near x {x:.1f} m, y {y:.1f} m: {error:.2f} m' for x, y, error in weak_places(forecast)
+        f'near x {x:.1f} m, y {y:.1f} m: {error:.2f} m' for x, y, error, _ in weak_places(forecast)
     ]
     even = f'Nowhere is the expected error more than {_WEAK} times the mean.'
     uneven = f'On {share:.0%} of the covered ground it is more than {_WEAK} times the mean.'
@@ -107,8 +99,8 @@ def weak_lines(trained: Trained) -> list[str]:
 
 def trust_lines(trained: Trained) -> list[str]:
     """The certificate and the calibration, in words."""
-    quality, found = trained.model.quality, trained.metric.diagnostics
-    angle = np.degrees(found.angle_std_rad)
+    quality = trained.model.quality
+    angle = np.degrees(trained.metric.diagnostics.angle_std_rad)
     proven = (
         'Proven: no other directions of the segments fit odometry and images better '
         if quality['certified']
@@ -116,26 +108,25 @@ def trust_lines(trained: Trained) -> list[str]:
     )
     return [
         proven + f'(certificate {quality["certificate"]:.1e}, at least zero up to rounding).',
-        f'Of the images that were left out, {quality["left_out_within_95"]:.0%} lie in the region '
-        'that claims to hold 95 %.',
+        f'Of the left-out images, {quality["left_out_within_95"]:.0%} lie in their 95 % region.',
         f'The least certain direction of a segment is known to {angle:.1f} degrees.',
-        'Not included: other light than in training, and a wheel radius that is wrong everywhere.',
+        'Not included: other light than in training, and a wrong wheel radius.',
     ]
 
 
 def advice(trained: Trained, places: Array) -> list[str]:
-    """What to drive next, after images at places (M, 2) m, most useful first."""
-    found, forecast = trained.metric.diagnostics, trained.metric.forecast
+    """What to drive next, most useful first; images were taken at places (M, 2) m."""
+    diagnostics, forecast = trained.metric.diagnostics, trained.metric.forecast
     lines = [
-        f'Cross x {x:.1f} m, y {y:.1f} m, in two directions.' for x, y, _ in weak_places(forecast)
+        f'Cross x {x:.1f} m, y {y:.1f} m, in two directions.' for x, y, *_ in weak_places(forecast)
     ]
-    if not found.one_route:
+    if not diagnostics.one_route:
         lines += sparse_lanes(places, InspectionConfig().reach)
-    if found.directions < PARALLEL:
+    if diagnostics.directions < PARALLEL:
         lines.append('Drive in other directions: most of this drive was parallel.')
-    if found.crossings < FEW_CROSSINGS:
-        lines.append(f'Cross your own track: this drive does so {found.crossings} times.')
-    return [*lines, 'For other light, drive once more when it is cloudy, or at another hour.']
+    if diagnostics.crossings < FEW_CROSSINGS:
+        lines.append(f'Cross your own track: this drive does so {diagnostics.crossings} times.')
+    return [*lines, 'For other light, drive again under clouds, or at another hour.']
 
 
 def coverage_figure(path: Path, trained: Trained, places: Array) -> None:

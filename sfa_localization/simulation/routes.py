@@ -17,7 +17,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 
 CLEARANCE_M = 0.8
-"""From the robot's center to any obstacle."""
+"""Smallest distance of the robot's center from an obstacle."""
 TIGHTEST_M = 0.8
 """Smallest radius of a curve."""
 CELL_M = 0.5  # side of the cells in which coverage is counted
@@ -69,7 +69,7 @@ class Coverage:
         self._passed = np.zeros(np.ceil(2 * lawn.half / CELL_M).astype(int) + 1, bool)
 
     def gain(self, points: Array) -> int:
-        """How many new cells points (N, 2) would pass."""
+        """Number of new cells that points (N, 2) would pass."""
         passed = np.zeros_like(self._passed)
         passed[self._cells(points)] = True
         return int((passed & ~self._passed).sum())

@@ -148,10 +148,6 @@ class SkyLook:
     hills: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
-GLOW_RAD = 0.7
-"""Angle from the sun at which its glow has fallen to 1/e."""
-
-
 def sky(rng: np.random.Generator, look: SkyLook, sun: NDArray[np.float64]) -> Image:
     """Sky with clouds, haze and far hills: BGR (SKY_ROWS, SKY_COLUMNS, 3), highest row first.
 
@@ -177,11 +173,11 @@ def _mix(below: Floats, above: Floats, cover: Floats) -> Floats:
 
 
 def _glow(elevation: Floats, azimuth: Floats, sun: NDArray[np.float64]) -> Floats:
-    """1 toward the sun, less around it, for elevations (R, 1) in degrees, azimuths (1, C) rad."""
+    """1 toward the sun, 1/e at 0.7 rad from it; elevations (R, 1) degrees, azimuths (1, C) rad."""
     up = np.radians(elevation)
     level = np.cos(azimuth) * sun[0] + np.sin(azimuth) * sun[1]
     toward = np.clip(np.cos(up) * level + np.sin(up) * sun[2], -1, 1)
-    return np.asarray(np.exp(-((np.arccos(toward) / GLOW_RAD) ** 2)), np.float32)
+    return np.asarray(np.exp(-((np.arccos(toward) / 0.7) ** 2)), np.float32)
 
 
 def _clouds(rng: np.random.Generator, elevation: Floats, azimuth: Floats, look: SkyLook) -> Floats:

@@ -27,16 +27,16 @@ STUDIES = {
     'all': 'the next five, which take hours',
     'simulator': "the paper's experiment in its simulator",
     'robot': "the paper's experiment with a robot, simulated",
-    'baselines': 'other features in the place of slow ones',
+    'baselines': 'other features instead of slow features',
     'ablations': 'this package without some of its parts',
     'light': 'train in one, two or three lights, test in every light and season',
-    'year': 'train once, then a drive a month, with and without updates of the model',
+    'year': 'train once, then drive each month, with and without updates of the model',
     'large': 'gardens of 16 m x 18 m to 64 m x 72 m, at one density of drives',
 }
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run what the first word names; the exit code."""
+    """Run the study that the first word names; return the exit code."""
     arguments = study_parser().parse_args(words)
     return guarded(lambda: int(arguments.run(arguments)))
 
@@ -75,11 +75,9 @@ def add_arguments(parser: argparse.ArgumentParser, name: str) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Make what is missing of the studies; print their tables."""
-    config, start = (
-        settings(StudyConfig, arguments),
-        'study_quick_' if arguments.quick else 'study_',
-    )
+    """Complete the studies, and print their tables."""
+    config = settings(StudyConfig, arguments)
+    start = 'study_quick_' if arguments.quick else 'study_'
     if bool(arguments.training) != bool(arguments.test):
         raise ConfigError('--training and --test: give both, or neither')
     chosen = (*NAMES, 'light') if arguments.study == 'all' else (arguments.study,)
@@ -87,9 +85,9 @@ def run(arguments: argparse.Namespace) -> int:
     if paper:
         _paper(paper, arguments.out or Path(f'{start}paper'), config, arguments)
     if 'light' in chosen:
-        own = arguments.out and (arguments.out / 'light' if paper else arguments.out)
+        out = arguments.out and (arguments.out / 'light' if paper else arguments.out)
         plan = light.QUICK if arguments.quick else light.FULL
-        cells = light.fill_matrix(own or Path(f'{start}light'), config, plan, progress=True)
+        cells = light.fill_matrix(out or Path(f'{start}light'), config, plan, progress=True)
         print(light_report.table(cells))
     if 'year' in chosen:
         months = year.QUICK_YEAR if arguments.quick else year.YEAR
@@ -106,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _paper(
     names: Sequence[str], out: Path, config: StudyConfig, arguments: argparse.Namespace
 ) -> None:
-    """Those results that share a folder: say how long they take, then make what is missing."""
+    """Announce the duration of the paper's results, then complete them in one folder."""
     plan, training = QUICK if arguments.quick else FULL, tuple(arguments.training)
     work = Work(out, config, plan, Progress(shown=True), training, arguments.test)
     lights = light.QUICK if arguments.quick else light.FULL

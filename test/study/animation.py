@@ -81,7 +81,7 @@ def in_truth(message):
 
 def draw(figure, path, shots, k):
     """Shot k: the panorama above a map with all of the true path (N, 2) m and a trail."""
-    shot, trail = shots[k], np.array([one.pose for one in shots[max(k - TRAIL, 0) : k + 1]])
+    shot, trail = shots[k], np.array([s.pose for s in shots[max(k - TRAIL, 0) : k + 1]])
     figure.clear()
     above, below = figure.subplots(2, 1, height_ratios=(72, 400))
     above.imshow(shot.panorama[..., ::-1], aspect='auto')

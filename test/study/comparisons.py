@@ -73,7 +73,7 @@ def baselines(site: Site, results: Results, world: str) -> None:
 
 
 def _judged(site: Site, study: Study, model: PlaceModel, name: str) -> Cell:
-    """Errors of one kind of features, or the `problem` that they have."""
+    """Errors of a kind of features, or the `problem` if they give no map."""
     rows = study.laid_on(SegmentConfig())
     if name == RETRIEVAL:
         return _retrieved(study)
@@ -94,33 +94,33 @@ def _judged(site: Site, study: Study, model: PlaceModel, name: str) -> Cell:
 
 
 def _retrieved(study: Study) -> Cell:
-    """The true position of the training image that is likest."""
+    """Errors of the true position of the most similar training image."""
     poses = np.column_stack([study.places, np.zeros(len(study.places))])
     retrieval = ImageRetrieval.of((image for batch in study.batches() for image in batch), poses)
     images = (i for batch in study.test.panoramas.batches(BATCH) for i in batch)
-    found = np.array([retrieval.locate(image)[:2] for image in images])
-    return {'test_supervised': mean_error(found, study.test_truth.poses[:, :2])}
+    places = np.array([retrieval.locate(image)[:2] for image in images])
+    return {'test_supervised': mean_error(places, study.test_truth.poses[:, :2])}
 
 
 class SlowFeaturesAlone(PlaceModel):
-    """A model that reads the place off slow features; what it turns is turned as keyframes say."""
+    """A model with positions from slow features, turned by the headings of the keyframes."""
 
     @classmethod
     def of(cls, model: PlaceModel) -> SlowFeaturesAlone:
         return cls(**{part.name: getattr(model, part.name) for part in fields(model)})
 
     def located(self, view: View, conditions: Conditions) -> Location:
-        found = PlaceModel.located(self, view, conditions)
-        (slow,) = self._slow_places(view, [Hypothesis(found.fit, 0)])
-        claimed, unlike = np.array([slow.variance]), np.array([found.fit.unlike])
+        location = PlaceModel.located(self, view, conditions)
+        (slow,) = self._slow_places(view, [Hypothesis(location.fit, 0)])
+        claimed, unlike = np.array([slow.variance]), np.array([location.fit.unlike])
         (variance,) = self.keyframes.errors.slow_variance(claimed, unlike)
         covariance = np.diag([variance, variance, UNKNOWN_YAW_VARIANCE])
-        return replace(found, pose=np.append(slow.place, 0.0), covariance=covariance)
+        return replace(location, pose=np.append(slow.place, 0.0), covariance=covariance)
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """This package with one thing different. `layers` empty: the standard network."""
+    """This package with a change. Empty `layers` mean the standard network."""
 
     metric: MetricConfig = field(default_factory=MetricConfig)
     segments: SegmentConfig = field(default_factory=SegmentConfig)
@@ -130,7 +130,7 @@ class Variant:
     light_std: float = LIGHT_STD
     second_pass: bool = True
     keyframes: bool = True
-    one_drive: bool = False
+    single_drive: bool = False
     """The map is learned from the last training drive: the paper's descent starts from odometry,
     whose frame is another one in each drive."""
     exact_odometry: bool = False
@@ -145,17 +145,17 @@ class Variant:
     @property
     def same_map(self) -> bool:
         """Whether it learns the map of the whole package, from its network."""
-        mine = self.metric, self.segments, self.second_pass, self.one_drive, self.exact_odometry
+        mine = self.metric, self.segments, self.second_pass, self.single_drive, self.exact_odometry
         return mine == (MetricConfig(), SegmentConfig(), True, False, False)
 
     def recipe(self, base: Recipe) -> Recipe:
-        """How it trains."""
+        """The recipe of the training."""
         network = replace(base.network, normalization=self.normalization)
         return replace(base, network=network, metric=self.metric, segments=self.segments)
 
     def drives(self, study: Study) -> tuple[Run, ...]:
-        """What its map is learned from."""
-        runs = study.training[-1:] if self.one_drive else study.training
+        """The drives from which the map is learned."""
+        runs = study.training[-1:] if self.single_drive else study.training
         return tuple(map(_exact, runs)) if self.exact_odometry else runs
 
     def reduced(self, model: PlaceModel) -> PlaceModel:
@@ -179,10 +179,10 @@ VARIANTS = {
     'straight segments only': Variant(segments=STRAIGHT),
     'monomials, 8 features; no second pass': Variant(metric=MONOMIALS),
     'the same, straight lines of one drive': Variant(
-        metric=MONOMIALS, segments=STRAIGHT, one_drive=True
+        metric=MONOMIALS, segments=STRAIGHT, single_drive=True
     ),
     "the same, paper's solver": Variant(
-        metric=replace(MONOMIALS, solver='paper'), segments=STRAIGHT, one_drive=True
+        metric=replace(MONOMIALS, solver='paper'), segments=STRAIGHT, single_drive=True
     ),
     'exact odometry in the training': Variant(exact_odometry=True),
     'no simulated rotation': Variant(rotate=False),
@@ -218,7 +218,7 @@ def ablations(site: Site, results: Results, world: str) -> None:
 
 
 def _exact(run: Run) -> Run:
-    """A drive whose odometry does not err."""
+    """A drive with exact odometry."""
     assert run.ground_truth is not None
     return replace(run, odometry=Odometry.along(run.ground_truth), yaw_rate=None)
 

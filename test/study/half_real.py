@@ -28,16 +28,16 @@ SETTINGS = (
     'world', 'seed', 'light', 'season', 'area', 'images', 'images_every', 'images_every_turn',
     'compression', 'storage', 'image_noise', 'illumination',
 )  # fmt: skip
-"""Of the simulation: those that a given drive leaves open."""
+"""Settings of the simulation that apply to a given drive."""
 
 POSE_GAP_S = 0.5
-"""No image is taken where the true poses pause for longer: the robot may be anywhere between."""
+"""Longest pause of the true poses in which images are taken."""
 
 
 def given_drive(truth: Trajectory, odometry: Odometry, config: SimulationConfig) -> SimulatedDrive:
-    """The drive of poses (N, 3) in frame `world` and of measured twists (M, 2); no images are made.
+    """The drive with poses (N, 3) in frame `world` and measured twists (M, 2), not yet rendered.
 
-    The poses of `odometry` are not read: they follow from its twists, from zero on. Images are
+    The poses of `odometry` are integrated from its twists. Images are
     taken every `images_every` m and every `images_every_turn` degrees. Stamps before the first
     simulated drive's, such as seconds from zero, are shifted there. Raises DataError where poses
     and odometry do not overlap, ConfigError where a pose is outside of the area.
@@ -67,7 +67,7 @@ def given_drive(truth: Trajectory, odometry: Odometry, config: SimulationConfig)
 
 
 def _image_stamps(truth: Trajectory, config: SimulationConfig) -> Stamps:
-    """Stamps of poses far enough from that of the image before; sums would count their jitter."""
+    """Stamps of poses far enough from the last image; the length of the path includes jitter."""
     steady = truth.covers(truth.stamps_ns + 1, round(POSE_GAP_S * 1e9))
     turn = np.radians(config.images_every_turn)
     chosen, last = [0], truth.poses[0]
@@ -80,7 +80,7 @@ def _image_stamps(truth: Trajectory, config: SimulationConfig) -> Stamps:
 
 
 def measured(log: Path) -> Odometry:
-    """What a log says; its poses are zero, and variances that it does not state."""
+    """The odometry of a log; poses and missing variances are zero."""
     table = read_table(log, ODOMETRY)
     stamps, values = table.stamps_ns, np.nan_to_num(table.values)
     return Odometry(stamps, np.zeros((len(stamps), 3)), values[:, :2], values[:, 2:])
@@ -97,13 +97,13 @@ def read_truth(path: Path) -> Trajectory:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the bag, both logs, and what they leave open."""
+    """Add the bag, both logs, and settings of the simulation."""
     parser.description, parser.formatter_class = __doc__, argparse.RawDescriptionHelpFormatter
     parser.set_defaults(run=run)
     parser.add_argument('out', type=Path, metavar='OUT_BAG', help='folder of the bag to write')
     parser.add_argument('--poses', type=Path, required=True, metavar='TRUTH', help='true poses')
     parser.add_argument(
-        '--odometry', type=Path, required=True, metavar='ODOM.csv', help='what it measured there'
+        '--odometry', type=Path, required=True, metavar='ODOM.csv', help='measured odometry'
     )
     parser.add_argument('--size', type=numbers, help='columns x rows of --images panorama')
     add_settings(parser, SimulationConfig, SETTINGS)
@@ -117,7 +117,7 @@ def run(arguments: argparse.Namespace) -> int:
         panorama = PanoramaConfig(width=width, height=height)
     odometry = measured(arguments.odometry)
     made = given_drive(read_truth(arguments.poses), odometry, config)
-    # No tree stands in the way of a robot that did not know of it.
+    # Without trees, which the given path may cross.
     garden = Garden(config.world, config, open_lawn=True)
     record(made, garden, config, arguments.out, panorama, progress=True)
     print(f'{arguments.out}: {len(made.image_stamps_ns)} images')

@@ -31,7 +31,7 @@ AREAS = {(16.0, 18.0): 0.2, (32.0, 36.0): 0.2, (64.0, 72.0): 0.3}
 QUICK_AREAS = {(8.0, 8.0): 0.2}
 PANORAMA = 300, 30
 KIDNAPPINGS, RIGHT_M = 6, 0.6
-"""How often the robot is carried along its test drive, and the error of a recovered estimate."""
+"""Number of kidnappings along the test drive, and the largest error of a recovered estimate."""
 
 
 def judge_areas(out: Path, config: StudyConfig, areas: dict[tuple[float, float], float]) -> str:
@@ -63,9 +63,9 @@ def _judge(out: Path, config: StudyConfig, area: tuple[float, float], every: flo
     frame = align(places, truth)
     model, recipe = trained.model, as_live(Recipe(), trained.model.panorama)
     run, seen = observed(bags[1], Observer(model), recipe, progress=True)
-    usable = [one for one in seen if not one.problem]
-    stamps = np.array([one.stamp_ns for one in usable])
-    single = Trajectory(stamps, np.array([one.pose for one in usable]))
+    usable = [image for image in seen if not image.problem]
+    stamps = np.array([image.stamp_ns for image in usable])
+    single = Trajectory(stamps, np.array([image.pose for image in usable]))
     path, sure = _fused(model, run, seen)
     ekf = score(run.ground_truth, moved(path, frame))
     back = list(_recoveries(model, run, seen, frame))
@@ -86,11 +86,11 @@ def _judge(out: Path, config: StudyConfig, area: tuple[float, float], every: flo
 def _fused(
     model: PlaceModel, run: Run, seen: Sequence[Observation], at_ns: int = 0, ahead_ns: int = 0
 ) -> tuple[Trajectory, Array]:
-    """The filter at the images, and whether it was LOCALISED there; at some stamp the robot is
-    carried to where it was so much later.
+    """The filter's path at the images, and whether it was LOCALISED; at `at_ns` the robot is moved
+    to where it was `ahead_ns` later.
     """
     localizer, states, odometry = Localizer(model), [], run.odometry
-    for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, [one.stamp_ns for one in seen]):
+    for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, [o.stamp_ns for o in seen]):
         if at_ns <= stamp_ns < at_ns + ahead_ns:
             continue
         now_ns = stamp_ns - (ahead_ns if stamp_ns >= at_ns else 0)
@@ -113,7 +113,7 @@ def _recoveries(
     for k in range(KIDNAPPINGS):
         at_ns, ahead_ns = round(start + (end - start) * (0.2 + 0.05 * k)), (end - start) * 2 // 5
         path, sure = _fused(model, run, seen, at_ns, ahead_ns)
-        apart = moved(path, frame).poses[:, :2] - run.ground_truth.at(path.stamps_ns)[:, :2]
-        back = sure & (np.hypot(*apart.T) < RIGHT_M) & (path.stamps_ns >= at_ns + ahead_ns)
+        errors = moved(path, frame).poses[:, :2] - run.ground_truth.at(path.stamps_ns)[:, :2]
+        back = sure & (np.hypot(*errors.T) < RIGHT_M) & (path.stamps_ns >= at_ns + ahead_ns)
         seconds = (path.stamps_ns[back] - at_ns - ahead_ns) * 1e-9
         yield float(seconds.min(initial=np.inf))

@@ -57,16 +57,14 @@ ALL_BUT = 'all but the tested'
 
 @dataclass(frozen=True, slots=True)
 class LightPlan:
-    """Size of the garden (m) and of the panoramas, where to test, the lights that `ALL_BUT` is
-    filled in for, and about how long it takes.
-
-    `minutes` are for two cores: measured of `QUICK`, of `FULL` estimated from two of its models.
+    """Size of the garden (m) and of the panoramas, conditions of the tests, lights of `ALL_BUT`,
+    and minutes on two cores.
     """
 
     area: tuple[float, float]
     panorama: tuple[int, int]
     tests: tuple[Condition, ...]
-    left_out: tuple[str, ...]
+    untrained_lights: tuple[str, ...]
     minutes: int
 
 
@@ -84,7 +82,7 @@ QUICK = LightPlan(
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """A model's training `lights`, in summer, and its `tests`, cells of the row `trained`."""
+    """The `lights` of a training, in summer, and its `tests`, cells of the row `trained`."""
 
     trained: str
     lights: tuple[str, ...]
@@ -92,10 +90,10 @@ class Training:
 
 
 def trainings(plan: LightPlan) -> Iterator[Training]:
-    """The models of a plan: one for each row, and for `ALL_BUT` one for each light left out."""
+    """The models of a plan: one for each row, and for `ALL_BUT` one for each tested light."""
     for trained, lights in TRAININGS.items():
         yield Training(trained, lights, plan.tests)
-    for light in plan.left_out:
+    for light in plan.untrained_lights:
         others = tuple(other for other in LIGHTS if other != light)
         yield Training(ALL_BUT, others, tuple(test for test in plan.tests if test[0] == light))
 
@@ -138,7 +136,7 @@ class _Work:
         return PanoramaConfig(width=self.plan.panorama[0], height=self.plan.panorama[1])
 
     def model(self, lights: Sequence[str], bags: Sequence[Path]) -> PlaceModel:
-        """The model of the training drives in some lights, which are in bags."""
+        """The model of the training drives `bags`, in some lights."""
         path = self.out / f'{"_".join(lights)}.npz'
         if not path.exists():
             self.progress.say(f'train on {" + ".join(lights)}')
@@ -164,7 +162,7 @@ def fill_matrix(
     report.say(f'this takes about {plan.minutes} minutes on two cores{done}')
     work = _Work(out, config, plan, report)
     for training in trainings(plan):
-        missing = [test for test in training.tests if not _found(results, training.trained, test)]
+        missing = [test for test in training.tests if not _is_done(results, training.trained, test)]
         if missing:
             _fill(work, replace(training, tests=tuple(missing)), results.keep)
     save_text(out / 'matrix.md', table(cells) + '\n')
@@ -173,12 +171,12 @@ def fill_matrix(
     return cells
 
 
-def _found(results: Results, trained: str, test: Condition) -> bool:
+def _is_done(results: Results, trained: str, test: Condition) -> bool:
     return results.find(trained=trained, light=test[0], season=test[1]) is not None
 
 
 def _fill(work: _Work, training: Training, keep: Callable[[Cell], None]) -> None:
-    """Train once and test in some lights; every finished cell is handed to `keep`."""
+    """Train once and test in some lights; `keep` receives every finished cell."""
     bags = [work.training(light) for light in training.lights]
     drives = [work.test(test) for test in training.tests]
     model = work.model(training.lights, bags)
@@ -211,8 +209,8 @@ def _judged(
     """Scores of one drive: `sfa` and `ekf` with `mean_m`, `heading_deg` and `within_95`, seconds
     `false_localised_s` and the share `localized` of the drive; and the transform to the truth.
 
-    The map is laid on the truth by the training drives, once. A drive without one usable
-    image has only the `problem`.
+    The map is aligned on the training drives, once. A drive without a usable image has only a
+    `problem`.
     """
     try:
         result = evaluate(model, bag, align_bags=() if transform else trained, transform=transform)
@@ -237,19 +235,19 @@ def _summary(scores: Mapping[str, Any]) -> Cell:
 
 
 def _slow_alone(model: PlaceModel, run: Run, transform: RigidTransform) -> Cell:
-    """Scores of the map without the keyframes, but for the headings that these show."""
+    """Scores of positions from the map alone, turned by the headings of the keyframes."""
     truth = _truth(run)
     places = model.metric.predict(features_of(turned_of(model), run))[0]
-    found = Trajectory(truth.stamps_ns, flat(places))
-    return _summary(score(truth, moved(found, transform)))
+    estimate = Trajectory(truth.stamps_ns, flat(places))
+    return _summary(score(truth, moved(estimate, transform)))
 
 
 def _paper_recipe(model: PlaceModel, training: Run) -> Callable[[Run], Cell]:
-    """The paper's recipe (section 4) on a model's one training drive, as a function that scores
-    single images of a test drive: monomials of the slow features, learned from straight lines.
+    """A function that scores the paper's recipe (section 4) on the single images of a test drive:
+    monomials of the slow features, learned from the straight lines of the training drive.
 
-    It is laid on the truth as the model is, by its estimates of all images of the training drive,
-    and has no heading. Where these lines give no map, there is only the `problem`.
+    It is aligned on all images of the training drive, and has no heading. If these lines give no
+    map, the score is a `problem`.
     """
     slow = slow_of(model.network)
     features = features_of(slow, training)
@@ -270,7 +268,7 @@ def _paper_recipe(model: PlaceModel, training: Run) -> Callable[[Run], Cell]:
 
 
 def _retrieval(runs: Sequence[Run]) -> ImageRetrieval:
-    """The images of the training drives at their true poses."""
+    """Retrieval of the images of the training drives, at their true poses."""
     images = (image for run in runs for batch in run.panoramas.batches(BATCH) for image in batch)
     return ImageRetrieval.of(images, np.concatenate([_truth(run).poses for run in runs]))
 

@@ -26,7 +26,7 @@ Cells = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """A score of a cell: its `path` in it, how it is written, and how bad it is, 0 good to 1."""
+    """A score of a cell: its `path`, its format, and its badness from 0 to 1 for the color."""
 
     title: str
     path: tuple[str, ...]
@@ -117,10 +117,10 @@ def _condition(cell: Mapping[str, Any]) -> str:
 
 
 def _value(cell: Mapping[str, Any], measure: Measure) -> float | None:
-    found: Any = cell
+    value: Any = cell
     for name in measure.path:
-        found = (found or {}).get(name)
-    return None if found is None else float(found)
+        value = (value or {}).get(name)
+    return None if value is None else float(value)
 
 
 def _text(measure: Measure, value: float | None) -> str:

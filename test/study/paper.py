@@ -35,10 +35,10 @@ from study.trials import (
     STRAIGHT,
     Study,
     Trial,
-    known_start,
     mean_distance,
     mean_error,
     slow_of,
+    true_start,
     turned_of,
 )
 
@@ -83,7 +83,7 @@ def experiment(site: Site, results: Results, name: str, seed: int, figures: Path
 def _by_recipe(
     study: Study, features: tuple[Array, Array], config: MetricConfig
 ) -> tuple[Cell, Paths | None]:
-    """Errors of the map of the slow features (N, K) and (T, K) that the straight lines give."""
+    """Errors of the map of slow features (N, K) and (T, K), learned from the straight lines."""
     segments = study.segments(STRAIGHT, only_last=True)
     rows = study.laid_on(STRAIGHT)
     try:
@@ -99,10 +99,10 @@ def _by_recipe(
 
 
 def _correlation(result: MetricResult, segments: Segments) -> ErrorCorrelation:
-    """Of the errors of images that are left out, along straight lines."""
+    """The correlation of errors of left-out images along straight lines."""
     stack = Stack.of(segments)
-    found = result.left_out, result.left_out_variance, np.cumsum(stack.steps), stack.owner
-    return ErrorCorrelation.fit(*found)
+    way_m = np.cumsum(stack.steps)
+    return ErrorCorrelation.fit(result.left_out, result.left_out_variance, way_m, stack.owner)
 
 
 def flat(places: Array) -> Array:
@@ -117,7 +117,7 @@ def _ours(site: Site, study: Study, model: PlaceModel) -> tuple[Cell, Paths]:
     trial = Trial.of(study, model.metric, study.features(turned_of(model)), rows, fitted)
     judged = evaluate(
         model, site.test, recipe=site.recipe, transform=trial.transform,
-        config=known_start(study.test, trial.transform),
+        config=true_start(study.test, trial.transform),
     )  # fmt: skip
     sfa, ekf = judged.scores['sfa'], judged.scores['ekf']
     scores = {'image': sfa['mean'], 'scaled': sfa['similarity']['mean'], 'ekf': ekf['mean']}
@@ -147,11 +147,11 @@ def _random_start(
             continue
         weights = np.column_stack([learned.real, learned.imag])
         side, transform = _nearest_frame(training @ weights, truth)
-        found, unseen = (transform.apply(t @ weights * [1, side]) for t in (training, test))
+        trained, tested = (transform.apply(t @ weights * [1, side]) for t in (training, test))
         places = study.test_truth.poses[:, :2]
-        cell = {'training': mean_error(found, truth), 'test': mean_error(unseen, places)}
+        cell = {'training': mean_error(trained, truth), 'test': mean_error(tested, places)}
         columns |= {column: cell} if column else {}
-        panels.append(report.Panel(f'iteration {iterations}', truth, found, stack.owner))
+        panels.append(report.Panel(f'iteration {iterations}', truth, trained, stack.owner))
     return panels
 
 
@@ -166,9 +166,9 @@ def random_parameters(lines: int, terms: int, size: Array, seed: int) -> Complex
 
 
 def _nearest_frame(places: Array, truth: Array) -> tuple[float, RigidTransform]:
-    """-1 for the mirror image of places (M, 2), else 1, and what then lays them on the truth."""
+    """-1 if the mirror image of places (M, 2) fits the truth better, else 1; and its alignment."""
     made = [(side, align(places * [1, side], truth)) for side in (1.0, -1.0)]
-    return min(made, key=lambda one: mean_error(one[1].apply(places * [1, one[0]]), truth))
+    return min(made, key=lambda k: mean_error(k[1].apply(places * [1, k[0]]), truth))
 
 
 def _figures(folder: Path, name: str, study: Study, paths: dict[str, Paths]) -> None:
@@ -178,15 +178,15 @@ def _figures(folder: Path, name: str, study: Study, paths: dict[str, Paths]) -> 
     chosen = {row: made for row, made in rows.items() if made is not None}
     owner = assignment(study.segments(STRAIGHT, only_last=True), len(study.places))
     for part, number in enumerate(numbers):
-        shown = {row: _panels(trial, part, owner) for row, (trial, *_) in chosen.items()}
-        report.panels_figure(folder / f'figure_{number}.png', shown)
+        panels = {row: _panels(trial, part, owner) for row, (trial, *_) in chosen.items()}
+        report.panels_figure(folder / f'figure_{number}.png', panels)
     if name == 'robot':
-        shown = {row: _fusion_panels(study, *made[1:]) for row, made in chosen.items()}
-        report.panels_figure(folder / 'figure_9.png', shown)
+        panels = {row: _fusion_panels(study, *made[1:]) for row, made in chosen.items()}
+        report.panels_figure(folder / 'figure_9.png', panels)
 
 
 def _panels(trial: Trial, part: int, owner: NDArray[np.int64]) -> list[report.Panel]:
-    """Of the training drive (part 0) or the test drive (1): supervised, raw, laid on the truth."""
+    """Panels of the training drive (part 0) or the test drive (1): supervised, raw, aligned."""
     truth, groups = trial.truth[part], None if part else owner[trial.rows]
     return [
         report.Panel('supervised', truth, trial.supervised[part], groups),

@@ -76,15 +76,15 @@ def _of_paper(name: str, row: str) -> str:
 
 def _values(cells: Cells, column: str, row: str) -> list[float]:
     """One number for each seed that has it."""
-    found = []
+    values = []
     for cell in cells:
         scores = {'odometry': cell['odometry'], **cell['columns'].get(column, {})}
         if 'ekf' not in scores:
             scores.pop('odometry')
         elif row == 'gain':
             scores['gain'] = 100 * (scores['ekf'] / scores['odometry'] - 1)
-        found += [scores[row]] if scores.get(row) is not None else []
-    return found
+        values += [scores[row]] if scores.get(row) is not None else []
+    return values
 
 
 def _text(row: str, values: Sequence[float]) -> str:
@@ -102,9 +102,9 @@ def comparison_table(cells: Cells, label: str, measures: Mapping[str, str]) -> s
     columns = [(w, text) for w in worlds for text in measures.values()]
     titles = [f'{text}, {w}' if len(worlds) > 1 else text for w, text in columns]
     lines = [[label, *titles], ['---', *['---:'] * len(titles)]]
-    found = {(str(cell['world']), str(cell[label])): cell for cell in cells}
+    by_name = {(str(cell['world']), str(cell[label])): cell for cell in cells}
     for name in names:
-        values = [found.get((w, name), {}).get(m) for w in worlds for m in measures]
+        values = [by_name.get((w, name), {}).get(m) for w in worlds for m in measures]
         lines.append([name, *(_UNKNOWN if v is None else f'{v:.3f}' for v in values)])
     return markdown(lines)
 
@@ -154,8 +154,8 @@ def _draw(axes: Axes, panel: Panel) -> None:
             part, color = panel.groups == group, f'C{number % 10}'
             axes.plot(*panel.truth[part].T, color=color, linestyle='--', linewidth=0.8)
             axes.plot(*estimate[part].T, color=color, linewidth=1.2)
-    shown = np.concatenate([panel.truth, _bulk(estimate)])
-    low, high = np.nanmin(shown, axis=0) - MARGIN_M, np.nanmax(shown, axis=0) + MARGIN_M
+    points = np.concatenate([panel.truth, _bulk(estimate)])
+    low, high = np.nanmin(points, axis=0) - MARGIN_M, np.nanmax(points, axis=0) + MARGIN_M
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel='x (m)', ylabel='y (m)')
     axes.set_aspect('equal')
     axes.grid(alpha=0.3)

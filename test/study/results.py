@@ -26,7 +26,7 @@ from sfa_localization.simulation.drive import simulate
 from sfa_localization.simulation.settings import SimulationConfig
 
 BATCH = 64
-"""Images that are read together."""
+"""Images in a batch."""
 Cell = dict[str, Any]
 
 
@@ -52,14 +52,15 @@ class Results:
 
     @classmethod
     def opened(cls, file: Path, settings: Mapping[str, Any], beside: Sequence[str] = ()) -> Results:
-        """Those in a folder, which is created. Raises LocalizationError for a folder of anything
-        else than this result, or those `beside` it (their files) with the same settings, and
-        leaves it as it is.
+        """The results in the folder of `file`, which is created.
+
+        Raises LocalizationError if the folder holds anything else than this result and the files
+        `beside` it with the same settings; then the folder is not changed.
         """
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            found = _found(file, beside, settings)
-            same, cells = found['settings'] == settings, list(found['cells'])
+            content = _content(file, beside, settings)
+            same, cells = content['settings'] == settings, list(content['cells'])
         except OSError as error:
             reason = error.strerror or error
             raise LocalizationError(f'{file}: {reason}: choose another folder with --out') from None
@@ -86,20 +87,18 @@ class Results:
         return next((c for c in self.cells if names.items() <= c.items()), None)
 
 
-def _found(file: Path, beside: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """What the file holds; the settings of one beside it, or the new ones in an empty folder."""
+def _content(file: Path, beside: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of the file; without it, the settings of a file beside it, or the new ones."""
     kin = [file.with_name(name) for name in beside if file.with_name(name).exists()]
     if not file.exists() and not kin and not any(file.parent.iterdir()):
         return {'settings': settings, 'cells': []}
     source = kin[0] if kin and not file.exists() else file
-    found = dict(json.loads(source.read_text(encoding='utf-8')))
-    return found if source == file else {**found, 'cells': []}
+    content = dict(json.loads(source.read_text(encoding='utf-8')))
+    return content if source == file else {**content, 'cells': []}
 
 
 def usual_drift(area: Sequence[float]) -> float:
-    """Mean odometry error, m, of a test drive in a garden: in a smaller one, drives are shorter and
-    drift less with the same wheels.
-    """
+    """Mean odometry error, m, of a test drive; it grows with the size of the garden."""
     usual = SimulationConfig()
     return usual.test_drift * math.sqrt(math.prod(area) / math.prod(usual.area))
 
@@ -107,7 +106,7 @@ def usual_drift(area: Sequence[float]) -> float:
 def settings_of(
     world: int, seed: int, area: Sequence[float], panorama: Sequence[int]
 ) -> dict[str, Any]:
-    """What decides the results of a garden, as JSON has it."""
+    """The settings that decide the results of a garden, as JSON."""
     return {
         'version': __version__,
         'world': world,
@@ -119,13 +118,13 @@ def settings_of(
 
 @dataclass(slots=True)
 class Progress:
-    """Messages and bars of long work, where they are wanted."""
+    """Messages and bars of long work, if `shown`."""
 
     shown: bool
     start: float = field(default_factory=time.monotonic)
 
     def say(self, step: str) -> None:
-        """Name the next step, with the seconds since the start."""
+        """Print the next step, with the seconds since the start."""
         if self.shown:
             sys.stderr.write(f'[{time.monotonic() - self.start:4.0f} s] {step}\n')
 
@@ -133,7 +132,7 @@ class Progress:
 def recorded(
     bag: Path, config: SimulationConfig, panorama: tuple[int, int], progress: Progress
 ) -> Path:
-    """The bag of a simulated drive with panoramas of (width, height), made where it is missing."""
+    """The bag of a simulated drive with panoramas of (width, height), simulated if missing."""
     if not bag.exists():
         progress.say(f'simulate {bag.name}')
         width, height = panorama

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Plain image retrieval, the simplest baseline of the field: the pose of the likest training image.
+"""Image retrieval, the simplest baseline: the pose of the most similar training image.
 
 Images are small, gray, of zero mean and unit norm, and correlated over all rotations of the camera.
 It is given the true poses of the training images, which nothing else here has.

@@ -24,11 +24,11 @@ Complex = NDArray[np.complex128]
 Batches = Callable[[], Iterable[Image]]
 
 COLUMNS, ROWS = 150, 30
-"""Largest size of the images that signatures are made of, as that of image retrieval."""
+"""Largest size of the images, as for image retrieval."""
 HARMONICS = 16
-"""Mean and harmonics 1 to 15 of each row: about the detail that the network's fields see."""
+"""Mean and harmonics 1 to 15 of each row, about the resolution of the receptive fields."""
 DIMENSIONS = 32
-"""Features that are kept: as many as the network has."""
+"""Number of features, that of the network."""
 
 
 def row_harmonics(image: Image) -> Complex:
@@ -57,7 +57,7 @@ class FourierSignature:
 
     @classmethod
     def fit(cls, batches: Batches) -> FourierSignature:
-        """On panoramas, in batches (T, h, w, C). Raises DataError for fewer than two."""
+        """Fit to panoramas in batches (T, h, w, C). Raises DataError for fewer than two."""
         count, total, second = 0, np.zeros(1), np.zeros((1, 1))
         for images in batches():
             vectors = _magnitudes(images)
@@ -90,7 +90,7 @@ class TurnedComponents:
 
     @classmethod
     def fit(cls, batches: Batches) -> TurnedComponents:
-        """On panoramas, in batches (T, h, w, C). Raises DataError for fewer than two."""
+        """Fit to panoramas in batches (T, h, w, C). Raises DataError for fewer than two."""
         count, moments = 0, np.zeros((1, 1, 1), complex)
         for images in batches():
             waves = np.array([row_harmonics(image) for image in images])

@@ -49,15 +49,15 @@ QUICK = SitePlan(
     {'simulator': 1, 'robot': 1, 'baselines': 2, 'ablations': 8},
 )
 ROUTES = {'simulator': ('coverage', 'lines'), 'robot': ('mower',)}
-"""Training drives of the experiments: the network is trained on the first, and the map is laid on
-the truth by the last."""
+"""Training drives of the experiments: the network is trained on the first, and the map is aligned
+with the truth on the last."""
 # The count of images settles in three or four.
 _TRIES = 30
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """One garden, or somewhere real: its training bags, the one to test on, and models of it."""
+    """A garden or a real place: its training bags, its test bag, and its models."""
 
     folder: Path
     training: tuple[Path, ...]
@@ -90,7 +90,7 @@ class Site:
         return Study.read(self.training, self.test, cache, self.recipe)
 
     def model(self, study: Study) -> PlaceModel:
-        """What this package makes of all training drives, with the network of the first one."""
+        """The model of all training drives, with the network of the first one."""
         path = self.folder / f'{"_".join(bag.name for bag in self.training)}.npz'
         if not path.exists():
             self.progress.say(f'train on {study.training[0].name}')
@@ -107,13 +107,13 @@ def network_of(runs: Sequence[Run], recipe: Recipe) -> Network:
 
 
 def learned(network: Network, runs: Sequence[Run], recipe: Recipe) -> PlaceModel:
-    """What a recipe makes of a trained network and training drives."""
+    """The model that a recipe learns from a trained network and training drives."""
     with one_core():
         return learn_place(network, runs, recipe).model
 
 
 def spaced(config: SimulationConfig, images: int | None) -> SimulationConfig:
-    """The settings of a drive with so many images, as far as their distance decides."""
+    """The settings of a drive, with the distance of images that gives so many of them."""
     if images is None:
         return config
     garden = Garden(config.world, config)

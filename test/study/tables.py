@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's results, one after the other: what is missing is made, then tables are written."""
+"""The paper's results: complete them one after the other, and write their tables."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Work:
     test: Path | None = None
 
     def announce(self, names: Sequence[str], minutes: int = 0) -> None:
-        """Say how long these results take, beside the `minutes` of others."""
+        """Announce the duration of these results, plus `minutes` of others."""
         for name in names:
             seeds = 1 if name == 'ablations' else self.config.seeds
             minutes += seeds * self.plan.minutes[name]
@@ -42,7 +42,7 @@ class Work:
         self.progress.say(f'this takes about {minutes} minutes on two cores; {kept}')
 
     def reproduced(self, name: str) -> str:
-        """Make what is missing of a result; write and return its table. LocalizationError."""
+        """Complete a result; write and return its table. Raises LocalizationError."""
         config, plan = self.config, self.plan
         settings = settings_of(config.world, config.seed, plan.area, plan.panorama)
         files = [f'{name}.json' for name in NAMES]

@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""One place, some training drives and one to test on; and maps from any features, judged there.
+"""Maps from any features, judged on training drives and a test drive in one place.
 
-Every map is judged by the paper's protocol (section 4): laid on the truth by its estimates of a
-training drive, and compared with a regression of the same features on the truth.
+Every map is judged by the paper's protocol (section 4): aligned with the truth on a training drive,
+and compared with a regression of the same features on the truth.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,11 @@ from numpy.typing import NDArray
 from sfa_localization.bags.drives import read_drive
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.geometry import Array, RigidTransform, align, compose, invert, rotation
 from sfa_localization.data.run import Image, Run, Trajectory
 from sfa_localization.evaluation import has_truth, score
 from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.replay import Track, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.keyframes.light import Conditions
@@ -40,17 +41,17 @@ from study.results import BATCH, Cell
 
 Rows = NDArray[np.int64]
 Features = Callable[[Image], Array]
-KNOWN_START = FilterConfig(initial_position_std=0.02, initial_yaw_std=0.02)
+TRUE_START = FilterConfig(initial_position_std=0.02, initial_yaw_std=0.02)
 """Section 5.1: the robot starts from a known location, with known heading; as from a dock."""
 STRAIGHT = SegmentConfig(segments='straight')
 MONOMIALS = MetricConfig(metric_map='monomials', slow_features=PAPER_FEATURES)
-"""Of the paper's recipe."""
+"""Settings of the paper's recipe."""
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """Training drives and a drive to test on, with the true positions (N, 2) and (T, 2) m of
-    their images; the map is laid on the truth by the last training drive.
+    """Training drives and a test drive, with the true positions (N, 2) and (T, 2) m of images; the
+    map is aligned on the last training drive.
     """
 
     drives: tuple[Drive, ...]
@@ -60,7 +61,7 @@ class Study:
 
     @classmethod
     def read(cls, bags: Sequence[Path], test: Path, cache: Path, recipe: Recipe) -> Study:
-        """From bags; their images go to the folder `cache`. Raises BagError or DataError."""
+        """Read bags; their images go to the folder `cache`. Raises BagError or DataError."""
         drives = []
         for bag in [*bags, test]:
             folder = cache / bag.name
@@ -88,18 +89,18 @@ class Study:
         return [sum(counts[:k]) for k in range(len(counts))]
 
     def segments(self, config: SegmentConfig, only_last: bool = False) -> Segments:
-        """Segments of all training drives, or of the last one; by rows among the images of all."""
+        """Segments of all training drives or of the last one, as rows among the images of all."""
         first = len(self.training) - 1 if only_last else 0
-        cut = [Drives((one,), Closures.none(), config).cut() for one in self.drives[first:]]
+        cut = [Drives((drive,), Closures.none(), config).cut() for drive in self.drives[first:]]
         return join(cut, self.starts[first:])
 
     def laid_on(self, config: SegmentConfig) -> Rows:
-        """Rows of the images that the map is laid on the truth by: in segments of the last one."""
+        """Rows of the images in segments of the last drive, on which the map is aligned."""
         segments = self.segments(config, only_last=True)
-        return self.known(np.concatenate([segment.images for segment in segments]))
+        return self.with_truth(np.concatenate([segment.images for segment in segments]))
 
-    def known(self, rows: Rows) -> Rows:
-        """Those of the rows (M,) of training images whose true position is known."""
+    def with_truth(self, rows: Rows) -> Rows:
+        """The rows (M,) of training images that have a true position."""
         return np.asarray(rows[np.isfinite(self.places[rows, 0])])
 
     def batches(self) -> Iterator[Image]:
@@ -133,7 +134,7 @@ def slow_of(network: Network) -> Features:
 
 
 def turned_of(model: PlaceModel) -> Features:
-    """What a model's map reads: maps turned by keyframes, reduced, or else slow features."""
+    """The features of a model's map: reduced turned maps, or slow features without them."""
     turned = model.turned
     if turned is None:
         return slow_of(model.network)
@@ -184,7 +185,7 @@ class Trial:
         raw_test, covariances = metric.predict(test)
         raw = metric.predict(training[rows])[0], raw_test
         transform = align(raw[0], study.places[rows])
-        fitted = study.known(fitted)
+        fitted = study.with_truth(fitted)
         weights = regression(metric.basis, training[fitted], study.places[fitted])
         turn = rotation(transform.yaw_rad)
         return cls(
@@ -216,17 +217,15 @@ class Trial:
         only, whose errors have this correlation.
         """
         run, stamps = self.study.test, self.study.test_truth.stamps_ns
-        settings = replace(KNOWN_START, initial_pose=tuple(start_of(run).tolist()))
-        fused, path = PoseFilter(settings, correlation), []
-        odometry = run.odometry
-        for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, stamps):
-            if kind == IMAGE:
-                fused.add_measurement(stamp_ns, self.laid[1][i], self.covariances[i])
-            elif not fused.add_odometry(stamp_ns, *odometry.twists[i], odometry.variances[i]):
-                path.append(fused.at(stamp_ns))
-        states = [state for state in path if state is not None]
-        poses = np.array([state.pose for state in states])
-        return Trajectory(np.array([state.stamp_ns for state in states]), poses)
+        settings = replace(TRUE_START, initial_pose=tuple(start_of(run).tolist()))
+        fused = PoseFilter(settings, correlation)
+        images = [
+            SimpleNamespace(pose=place, covariance=covariance, turned=np.nan)
+            for place, covariance in zip(self.laid[1], self.covariances, strict=True)
+        ]
+        steps = replay(fused, run.odometry, stamps, images)
+        path = [fused.at(stamp_ns) for stamp_ns, image, _ in steps if image is None]
+        return Track.of([state for state in path if state is not None]).poses
 
 
 def start_of(run: Run) -> Array:
@@ -235,19 +234,17 @@ def start_of(run: Run) -> Array:
     return np.asarray(run.ground_truth.at(run.odometry.stamps_ns[:1])[0])
 
 
-def known_start(run: Run, transform: RigidTransform) -> FilterConfig:
-    """The filter's settings for a start at the true pose, in the map that `transform` lays on the
-    truth.
-    """
+def true_start(run: Run, transform: RigidTransform) -> FilterConfig:
+    """The filter's settings for a start at the true pose; `transform` leads from map to truth."""
     laid = np.array([transform.x_m, transform.y_m, transform.yaw_rad])
-    return replace(KNOWN_START, initial_pose=tuple(compose(invert(laid), start_of(run)).tolist()))
+    return replace(TRUE_START, initial_pose=tuple(compose(invert(laid), start_of(run)).tolist()))
 
 
 def mean_distance(path: Trajectory, truth: Trajectory) -> float:
-    """Mean distance (m) of a path from the true one, where that is known."""
+    """Mean distance (m) of a path from the truth, where the truth covers it."""
     return float(score(truth, path)['mean'])
 
 
 def mean_error(places: Array, truth: Array) -> float:
-    """Mean distance (m) of places (N, 2) from true ones (N, 2), where these are known."""
+    """Mean distance (m) of places (N, 2) from true ones (N, 2), without NaN."""
     return float(np.nanmean(np.hypot(*(places - truth).T)))

@@ -87,7 +87,7 @@ class _Work:
         return recorded(bag, config, self.plan.panorama, self.progress)
 
     def trained(self, name: str, *drives: int) -> PlaceModel:
-        """The model of some drives."""
+        """The model trained on some drives."""
         path = self.out / f'{name}.npz'
         if not path.exists():
             bags = [self.drive(number) for number in drives]
@@ -96,7 +96,7 @@ class _Work:
         return PlaceModel.load(path)
 
     def updated(self, model: PlaceModel, number: int) -> PlaceModel:
-        """A model after the drive of a month; itself where the robot was never sure there."""
+        """The model, updated by the drive of a month unless the robot was never LOCALISED."""
         path = self.out / f'updated_{number:02d}.npz'
         if not path.exists():
             try:
@@ -127,7 +127,7 @@ def judge_year(
 
 
 def _fill(work: _Work, results: Results) -> None:
-    """Judge every model that is not judged yet, month by month."""
+    """Judge the missing models, month by month."""
     frozen = updated = work.trained('frozen', 0)
     transform = None
     for number, (month, light, season) in enumerate(MONTHS, 1):
@@ -139,8 +139,8 @@ def _fill(work: _Work, results: Results) -> None:
                 continue
             work.progress.say(f'{month}, {light}, {season}: {name}')
             # The map of a model that was trained anew lies elsewhere.
-            known = None if name == 'retrained' else transform
-            scores, fitted = _judged(model, work.drive(number), work.drive(0), known)
+            given = None if name == 'retrained' else transform
+            scores, fitted = _judged(model, work.drive(number), work.drive(0), given)
             transform = transform if name == 'retrained' else fitted
             names = {'model': name, 'month': month, 'light': light, 'season': season}
             results.keep({**names, **scores})

@@ -25,9 +25,9 @@ def table(cells: Cells) -> str:
     titles = [f'{title}, {model}' for title, _ in MEASURES.values() for model in models]
     lines = [['month', 'light, season', *titles], ['---'] * 2 + ['---:'] * len(titles)]
     for month in _months(cells):
-        own = {cell['model']: cell for cell in cells if cell['month'] == month}
-        first = next(iter(own.values()))
-        texts = [_text(name, own.get(m, {}).get(name)) for name in MEASURES for m in models]
+        by_model = {cell['model']: cell for cell in cells if cell['month'] == month}
+        first = next(iter(by_model.values()))
+        texts = [_text(name, by_model.get(m, {}).get(name)) for name in MEASURES for m in models]
         lines.append([month, f'{first["light"]}, {first["season"]}', *texts])
     means = [_text(name, _mean(cells, name, m)) for name in MEASURES for m in models]
     lines.append(['mean', '', *means])
@@ -43,9 +43,9 @@ def _models(cells: Cells) -> list[str]:
 
 
 def _mean(cells: Cells, name: str, model: str) -> float | None:
-    """Of a model that was judged in every month: other months are easier or harder."""
-    known = [c[name] for c in cells if c['model'] == model and c.get(name) is not None]
-    return sum(known) / len(known) if len(known) == len(_months(cells)) else None
+    """The mean of a measure for a model that was judged in every month."""
+    values = [c[name] for c in cells if c['model'] == model and c.get(name) is not None]
+    return sum(values) / len(values) if len(values) == len(_months(cells)) else None
 
 
 def _text(name: str, value: float | None) -> str:
