@@ -19,10 +19,9 @@ from sfa_localization.data.geometry import (
     invert,
 )
 from sfa_localization.data.statistics import evenly
-from sfa_localization.metric import phases
 from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.map_fit import MapFit
-from sfa_localization.metric.pose_graph import SHOWN
+from sfa_localization.metric.pose_graph import SAMPLED
 from sfa_localization.metric.saved_map import MetricMap
 
 
@@ -31,69 +30,26 @@ def plane(points: Complex) -> Array:
     return np.column_stack([points.real, points.imag])
 
 
-def angle_covariance(fit: MapFit) -> Array:
-    """Covariance (N, N) of the directions, rad^2, relative to the rotation of the whole map."""
-    if fit.problem.graph is not None:
-        return fit.problem.graph.angle_covariance
-    return np.asarray(fit.link_variance * phases.angle_covariance(fit.solution.h, fit.solution.z))
-
-
 def place_variance(fit: MapFit) -> Array:
     """How uncertain the segments leave the map at the place of each image, (M,) m^2 over both axes,
-    without a motion of the whole map, which is a matter of its frame.
+    relative to the whole map.
 
-    The map is a regression to the places of all images: it repeats the errors that neighbors have
-    in common. What a stretch errs alone it averages out; images that are left out show that.
+    The map is a regression to the places of all images: it repeats the errors that neighbors share.
+    The errors of one image it averages out; images that are left out show those.
     """
-    shown = evenly(len(fit.places), SHOWN)
-    repeated = fit.ridge.averages(shown)
-    graph = fit.problem.graph
-    variance = graph.variance(repeated) if graph else _variance(fit, repeated)
-    return np.interp(np.arange(len(fit.places)), shown, variance)
-
-
-def _variance(fit: MapFit, shares: Array) -> Array:
-    """Of the sums of the images' places by shares (K, M), without a graph: (K,) m^2."""
-    stack, places = fit.stack, fit.places
-    origins, directions = _uncertain_segments(fit)
-    path = stack.corrected(fit.solution.bias)
-    moved = origins[stack.owner] + directions[stack.owner] * path[:, None]
-    around_center = 1j * (places - places.mean())
-    turn = np.real(np.conj(around_center) @ moved) / np.sum(np.abs(around_center) ** 2)
-    moved = moved - moved.mean(0) - around_center[:, None] * turn
-    return np.asarray((np.abs(shares @ moved) ** 2).sum(1))
-
-
-def _uncertain_segments(fit: MapFit) -> tuple[Complex, Complex]:
-    """Changes of origins and directions (N, 3N each), one standard deviation a column.
-
-    First those of the directions, which the origins follow; then of the origins along both axes.
-    """
-    solution = fit.solution
-    form, n = fit.form(fit.ridge), fit.stack.segments
-    bias = -solution.bias[form.period]
-    follow = form.origins[:, :n] + form.origins[:, n:] * bias
-    values, vectors = np.linalg.eigh(angle_covariance(fit))
-    turned = 1j * solution.z[:, None] * (vectors * np.sqrt(np.maximum(values, 0.0)))
-    values, vectors = np.linalg.eigh(form.own)
-    # Moving all origins together costs nothing, and is no error of the map.
-    fixed = values > 1e-9 * values[-1]
-    scale = np.sqrt(fit.link_variance / np.where(fixed, values, 1.0)) * fixed
-    own = vectors * scale
-    origins = np.hstack([follow @ turned, own, 1j * own])
-    return origins, np.hstack([turned, np.zeros((n, 2 * n))])
+    sample = evenly(len(fit.places), SAMPLED)
+    variance = fit.graph.variance(fit.ridge.averages(sample))
+    return np.interp(np.arange(len(fit.places)), sample, variance)
 
 
 def places_of_points(fit: MapFit) -> tuple[Complex, Complex]:
-    """Where the drive puts the robot at measured points (K,), and the covariance (K, K) per axis of
-    that, without a motion of the whole map; 0 for the paper's descent."""
-    measured, solution, period = fit.problem.segments.points, fit.solution, fit.stack.period
-    graph = fit.problem.graph
+    """Where the segments put the robot at measured points (K,), and the covariance (K, K) per axis,
+    relative to the whole map."""
+    measured = fit.problem.segments.points
     if measured is None:
         return np.zeros(0, complex), np.zeros((0, 0), complex)
     rows = measured.rows(fit.stack)
-    known = np.zeros((len(rows), len(rows)), complex) if graph is None else graph.covariance(rows)
-    return rows @ solution.coefficients(period), known
+    return rows @ fit.graph.poses.coefficients(fit.stack.period), fit.graph.covariance(rows)
 
 
 def metric_map(fit: MapFit, frame: RigidTransform, inflation: float, common_m: float) -> MetricMap:
@@ -121,7 +77,7 @@ def _start_frame(fit: MapFit) -> RigidTransform:
     starts, variances = _odometry(fit)
     rows = np.flatnonzero(stack.owner < len(starts))
     x, y, yaw = starts[stack.owner[rows]].T
-    driven = x + 1j * y + np.exp(1j * yaw) * stack.corrected(fit.solution.bias)[rows]
+    driven = x + 1j * y + np.exp(1j * yaw) * stack.corrected(fit.graph.poses.bias)[rows]
     weights = 1.0 / (variances[stack.owner[rows]] + fit.variance)
     turn, shift = align_complex(fit.places[rows], driven, weights)
     frame = RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
@@ -140,7 +96,7 @@ def _odometry(fit: MapFit) -> tuple[Array, Array]:
     """
     links, stack = fit.problem.links, fit.stack
     unbroken = np.cumprod(links.at == np.arange(len(links.at))).astype(bool)
-    bias = fit.solution.bias[stack.period[links.at]]
+    bias = fit.graph.poses.bias[stack.period[links.at]]
     turned = (links.turn_rad - bias * links.turn_time_s)[unbroken]
     moved = (links.displacement - bias * links.displacement_drift)[unbroken]
     x, y, yaw = stack.starts[0]

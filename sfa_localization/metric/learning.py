@@ -28,7 +28,6 @@ from sfa_localization.data.statistics import evenly
 from sfa_localization.metric import paper_solver
 from sfa_localization.metric.drive_check import Diagnostics, check, check_amount, diagnose
 from sfa_localization.metric.fitted_map import (
-    angle_covariance,
     map_frame,
     metric_map,
     places_of_points,
@@ -37,8 +36,7 @@ from sfa_localization.metric.fitted_map import (
 from sfa_localization.metric.forecast import Forecast
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.mount import Mount
-from sfa_localization.metric.phases import Certificate, certify, refine
-from sfa_localization.metric.pose_graph import Graph
+from sfa_localization.metric.pose_graph import Certificate, Graph
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.selection import LeftOut, choose, leave_out
@@ -70,7 +68,7 @@ class MetricResult:
     yaw_bias: Array
     """(R,) rad/s: by how much the odometry turned too fast in each period."""
     certificate: Certificate
-    """Of the directions; the paper's descent seldom ends close enough to have one."""
+    """Of the directions; of the paper's descent that of the minimum near which it ended."""
     images: Indices
     """(M,) images of the segments, in order."""
     residuals: Array
@@ -136,7 +134,7 @@ def learn_metric(
     """
     problem = MetricProblem.of(features, segments, config, seed)
     check_amount(problem.stack, problem.links)
-    tied = len(segments.closures) or len(segments.offsets.images) or segments.points
+    tied = len(segments.offsets.images) or segments.points
     if tied and config.solver == 'certified':
         problem = replace(problem, graph=(onto and onto.graph) or Graph.of(segments))
     fit = paper_solver.learn(problem) if config.solver == 'paper' else choose(problem, scale)
@@ -159,15 +157,11 @@ def learn_metric(
 
 
 def _check_certificate(fit: MapFit) -> None:
-    """Reject directions that are not proven; of the paper's descent, those near a wrong minimum."""
-    solution, certificate = fit.solution, fit.certificate
-    paper = fit.problem.config.solver == 'paper'
-    if paper:
-        certificate = certify(solution.h, refine(solution.h, solution.z))
-    if certificate.certified:
+    """Raise DataError for directions that are not proven to be the best."""
+    if fit.graph.certificate.certified:
         return
-    value = f'(certificate {certificate.eigenvalue:.1e})'
-    if paper:
+    value = f'(certificate {fit.graph.certificate.eigenvalue:.1e})'
+    if fit.problem.config.solver == 'paper':
         raise DataError(f'the descent ended in a wrong minimum {value}: set solver: certified')
     raise DataError(
         f'the best directions found are not proven to be optimal {value}: the odometry contradicts '
@@ -189,13 +183,13 @@ def _result(
     common_m = float(np.sqrt((drive_std**2).mean() / 2))
     turn, shift = np.exp(1j * frame.yaw_rad), frame.x_m + 1j * frame.y_m
     points, points_covariance = places_of_points(fit)
-    yaw = fit.stack.yaws(fit.solution)
+    yaw = fit.stack.yaws(fit.graph.poses)
     return MetricResult(
         map=metric_map(fit, frame, inflation, common_m),
         poses=np.column_stack([plane(fit.places * turn + shift), wrap_angle(yaw + frame.yaw_rad)]),
-        angle_covariance=angle_covariance(fit),
-        yaw_bias=fit.solution.bias,
-        certificate=fit.certificate,
+        angle_covariance=fit.graph.angle_covariance,
+        yaw_bias=fit.graph.poses.bias,
+        certificate=fit.graph.certificate,
         images=fit.stack.images,
         residuals=plane(fit.residuals * turn),
         left_out=plane(left.errors * turn),

@@ -38,7 +38,7 @@ from sfa_localization.data.messages import LARGEST_SCALE
 from sfa_localization.data.run import Odometry, Points, Stamps
 
 if TYPE_CHECKING:
-    from sfa_localization.metric.stack import Solution, Stack
+    from sfa_localization.metric.stack import SegmentPoses, Stack
 
 
 WHEELS_STD = 0.02
@@ -125,7 +125,7 @@ class MeasuredPoints:
         beside = stack.facing_rows(rows, placed * self.offset)
         return np.asarray((stack.place_rows(rows, placed) + beside).toarray())
 
-    def ties(self, stack: Stack, before: Solution | None = None) -> sparse.csr_array:
+    def ties(self, stack: Stack, before: SegmentPoses | None = None) -> sparse.csr_array:
         """What is squared (K, 3N) of the used points in [o, z, -b z], over its standard deviation.
 
         The heading of the points turns with the mean of the segments from what it is in the

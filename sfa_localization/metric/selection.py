@@ -16,8 +16,8 @@ from sfa_localization.metric.basis import PAPER_FEATURES, Basis, Monomials, Proc
 from sfa_localization.metric.fitted_map import place_variance, plane
 from sfa_localization.metric.forecast import Forecast, ground_distances, importance, nearest_used
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
-from sfa_localization.metric.phases import phase_cost, refine
-from sfa_localization.metric.quadratic_form import Ridge
+from sfa_localization.metric.pose_graph import cost, refined
+from sfa_localization.metric.ridge import Ridge
 from sfa_localization.metric.stack import Stack
 
 INDUCING_POINTS = 1000
@@ -99,11 +99,11 @@ def leave_out(fit: MapFit) -> LeftOut:
     variances = np.zeros(len(stack.images))
     part = folds(stack, fit.problem.seed)
     for rows in (np.flatnonzero(part == number) for number in np.unique(part)):
-        ridge, solution = fit.without(rows)
-        found, left = solution.places(stack), fit.ridge.expanded[rows]
-        turn, shift = align_complex(found, places, ridge.weights)
-        errors[rows] = places[rows] - (turn * (left @ ridge.fitted(found)) + shift)
-        spread = (ridge.whitened(left) ** 2).sum(0)
+        ridge, poses = fit.without(rows)
+        others, expanded = poses.places(stack), fit.ridge.expanded[rows]
+        turn, shift = align_complex(others, places, ridge.weights)
+        errors[rows] = places[rows] - (turn * (expanded @ ridge.fitted(others)) + shift)
+        spread = (ridge.whitened(expanded) ** 2).sum(0)
         variances[rows] = fit.variance * (1.0 / fit.ridge.weights[rows] + spread)
     distances, weight = on_the_ground(fit)
     drive_std = np.sqrt(place_variance(fit))
@@ -114,23 +114,21 @@ def leave_out(fit: MapFit) -> LeftOut:
 
 
 def evidence(basis: Basis, now: MapFit) -> float:
-    """Negative log evidence of a Gaussian process's hyper-parameters, at their best directions.
+    """Negative log evidence of a Gaussian process's hyper-parameters, at their best poses.
 
     Origins have flat priors (restricted likelihood); the signal's variance is profiled out.
     """
-    ridge, noise, z = Ridge.of(basis, now.problem.features), float(basis.ridge[0]), now.solution.z
-    form = now.form(ridge)
-    h = form.at(now.solution.bias)
-    cost = 2.0 * phase_cost(h, refine(h, z))
-    points, segments = len(ridge.expanded), len(z)
-    own = form.own + np.trace(form.own) / segments**2
-    freedom = points - segments
+    ridge, noise, stack = Ridge.of(basis, now.problem.features), float(basis.ridge[0]), now.stack
+    form, segments = now.form(ridge), stack.segments
+    squares = now.image_variance * cost(form, refined(form, stack, now.graph.poses), stack)
+    origins = now.image_variance * form[:segments, :segments].real
+    points, freedom = len(ridge.expanded), len(ridge.expanded) - segments
     return (
-        freedom * float(np.log(cost / noise / freedom))
+        freedom * float(np.log(squares / noise / freedom))
         + (points - len(basis.ridge) + 1 - segments) * float(np.log(noise))
         - float(np.log(ridge.weights).sum())
         + ridge.log_determinant
-        + float(np.linalg.slogdet(own)[1])
+        + float(np.linalg.slogdet(origins + np.trace(origins) / segments**2)[1])
     )
 
 
