@@ -142,8 +142,9 @@ def errors_of(result, poses):
 @pytest.mark.parametrize('wrong', [0.0, 0.15])
 def test_offsets_tie_drives_that_share_no_feature(wrong, quick):
     poses, features, segments, _ = in_two_lights()
-    with pytest.raises(DataError, match='directions are uncertain'):
-        learn_metric(features, segments, GP)
+    if not wrong:
+        with pytest.raises(DataError, match='directions are uncertain'):
+            learn_metric(features, segments, GP)
     offsets, rng = mixtures(Stack.of(segments), poses), np.random.default_rng(0)
     lies = rng.random(len(offsets.images)) < wrong
     turn = np.where(lies[:, None], rng.uniform(-np.pi, np.pi, offsets.turn.shape), offsets.turn)
@@ -336,7 +337,7 @@ def test_doors_of_a_corridor_that_look_alike_close_no_loop():
     assert with_closures(segments, closures).closures.images.tolist() == true.tolist()
 
 
-def test_what_is_left_out_is_left_out_of_every_drive_along_the_track():
+def test_what_is_held_out_is_held_out_of_every_drive_along_the_track():
     _, segments = twice_along_one_track()
     stack, track = Stack.of(segments), tracks(segments)
     part = selection.folds(stack, 0)

@@ -105,7 +105,7 @@ def test_noiseless_data_gives_no_error(mode):
     assert result.certificate.certified
     assert np.abs(result.residuals).max() < 1e-9
     # A left-out segment that nothing links is held by rounding alone.
-    assert result.left_out_error_m < 1e-7
+    assert result.held_out_error_m < 1e-7
 
 
 @pytest.mark.parametrize('kind', ['straight', 'any'])
@@ -227,9 +227,9 @@ def test_what_positions_have_in_common_errors_is_about_as_large_as_they_err():
     assert 0.55 < np.sqrt(np.mean(claimed) / np.mean(true)) < 1.3
 
 
-def test_left_out_segments_calibrate_the_covariance():
+def test_held_out_segments_calibrate_the_covariance():
     result = noisy_result()[3]
-    ratio = (result.left_out**2).sum(1) / result.left_out_variance
+    ratio = (result.held_out**2).sum(1) / result.held_out_variance
     for share, slack in ((0.5, 1e-3), (0.95, 2e-3)):
         assert share_within(ratio, share, result.forecast.weight) >= share - slack
 

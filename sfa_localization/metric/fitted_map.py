@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The map of a fit in the map frame, and how uncertain its directions, places and weights are.
+"""The map of a fit in the map frame, and how uncertain its places and weights are.
 
 The paper leaves the frame open (end of section 3.2): found solutions may be translated and rotated.
 Here it is the odometry frame at the start of the first run, or given by `start_pose` or points.
@@ -63,16 +63,16 @@ def metric_map(fit: MapFit, frame: RigidTransform, inflation: float, common_m: f
 def map_frame(fit: MapFit) -> RigidTransform:
     """The transform from the fit's arbitrary frame to the map frame.
 
-    The certified track is aligned with the odometry of the first run, each image weighted by how
-    little the odometry can have drifted until then: the map coincides with the odometry frame at
-    the start of the run. With a `start_pose`, the run starts there. Measured points come first.
+    The map frame is the odometry frame at the start of the first run; with a `start_pose`, that run
+    starts there. Measured points come first.
     """
     start, measured = _start_frame(fit), fit.problem.segments.points
     return start if measured is None else measured.frame(places_of_points(fit)[0], start)
 
 
 def _start_frame(fit: MapFit) -> RigidTransform:
-    """By the odometry at the start of the first run, or the pose that it is to have."""
+    """By the odometry at the start of the first run, each image weighted by how little the odometry
+    can have drifted until then, or by the pose that the run is to have."""
     segments, stack, pose = fit.problem.segments, fit.stack, fit.problem.config.start_pose
     starts, variances = _odometry(fit)
     rows = np.flatnonzero(stack.owner < len(starts))
@@ -80,13 +80,11 @@ def _start_frame(fit: MapFit) -> RigidTransform:
     driven = x + 1j * y + np.exp(1j * yaw) * stack.corrected(fit.graph.poses.bias)[rows]
     weights = 1.0 / (variances[stack.owner[rows]] + fit.variance)
     turn, shift = align_complex(fit.places[rows], driven, weights)
-    frame = RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
-    if not pose:
-        return frame
-    start = segments.mount.base(segments[0].start[None], 0)[0]
-    to_pose = compose(np.array(pose), invert(start))
-    moved = compose(to_pose, np.array([frame.x_m, frame.y_m, frame.yaw_rad]))
-    return RigidTransform(*(float(value) for value in moved))
+    frame = np.array([shift.real, shift.imag, float(np.angle(turn))])
+    if pose:
+        start = segments.mount.base(segments[0].start[None], 0)[0]
+        frame = compose(compose(np.array(pose), invert(start)), frame)
+    return RigidTransform(*frame.tolist())
 
 
 def _odometry(fit: MapFit) -> tuple[Array, Array]:

@@ -68,7 +68,7 @@ def learn_keyframes(
     poses, rows = keyframes.poses[tried], rows[tried]
     ground_m = ground_distances(keyframes.poses[:, :2], np.random.default_rng(0))
     trials = LeftOut.of(fits, poses, importance(near_m, ground_m))
-    slow, claimed = result.left_out[rows], result.left_out_variance[rows]
+    slow, claimed = result.held_out[rows], result.held_out_variance[rows]
     errors = trials.learn_slow(trials.learn(), slow, claimed)
     both, variance = trials.fused(errors, slow, claimed)
     weight, driven, owner = trials.weight, *_driven(segments, turn_radius_m)

@@ -27,7 +27,6 @@ from sfa_localization.metric.basis import Monomials, monomials
 from sfa_localization.metric.drive_check import check, diagnose
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.paper_solver import Lines, descend, odometry_start
-from sfa_localization.metric.phases import phase_cost
 from sfa_localization.metric.segments import Segments, cut
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
@@ -76,7 +75,7 @@ def certified(trial: Problem) -> dict[str, float]:
     own = np.column_stack([found.real, found.imag])
     weights = np.linalg.lstsq(expanded, truth, rcond=None)[0]
     return {
-        'certified': result.certificate.certified,
+        'certified': result.graph.certificate.certified,
         'ms': 1e3 * seconds,
         'uml': error(align(own, truth).apply(own), truth),
         'supervised': error(expanded @ weights, truth),
@@ -108,9 +107,9 @@ def descents(trial: Problem, seed: int, iterations: int) -> dict[str, float]:
     problem = MetricProblem.of(trial.features, replace(trial.segments, items=alone), CONFIG)
     basis = Monomials.fit(problem.features, 8, 0.0)
     known = MetricProblem.of(trial.features, trial.segments, CONFIG).fit(basis)
-    best = problem.fit(basis, known).solution
-    least = phase_cost(best.h, best.z)
-    stack = problem.stack
+    fit, stack = problem.fit(basis, known), problem.stack
+    best = fit.graph.poses.coefficients(stack.period)
+    least = np.vdot(best, fit.ridge.gram(stack) @ best).real / 2
     regressors = monomials(problem.features)
     lines = Lines(regressors, stack.path.real, stack.owner, np.zeros(0))
     starts = {

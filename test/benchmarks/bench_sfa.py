@@ -28,7 +28,7 @@ from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.data.threads import one_core
 from sfa_localization.metric.basis import Process
-from sfa_localization.metric.saved_map import MetricMap, squares
+from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.sfa import mdp_engine
 from sfa_localization.sfa.network import standard_architecture
@@ -213,7 +213,7 @@ def bare_process(learned: MetricMap, features: np.ndarray) -> list[Callable[[], 
     scaled = features[:, : basis.features] * basis.scale
     kernel = np.ones((len(features), len(basis.points)))
     made = [_product(scaled, basis.points.T.copy()), _product(kernel, learned.linear)]
-    return [*made, lambda: squares(kernel, learned.factor)]
+    return [*made, lambda: kernel @ learned.factor]
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> Callable[[], object]:

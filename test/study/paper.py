@@ -101,7 +101,7 @@ def _by_recipe(
 def _correlation(result: MetricResult, segments: Segments) -> ErrorCorrelation:
     """Of the errors of images that are left out, along straight lines."""
     stack = Stack.of(segments)
-    found = result.left_out, result.left_out_variance, np.cumsum(stack.steps), stack.owner
+    found = result.held_out, result.held_out_variance, np.cumsum(stack.steps), stack.owner
     return ErrorCorrelation.fit(*found)
 
 
