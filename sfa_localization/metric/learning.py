@@ -150,8 +150,10 @@ def learn_metric(
     diagnostics = diagnose(fit)
     _check_certificate(fit)
     check(diagnostics)
-    by_points = segments.points is not None and segments.points.settled.used.any()
-    frame = map_frame(fit) if onto is None or by_points else _frame_of(onto, fit)
+    frame = map_frame(fit)
+    if onto is not None and not (segments.points and segments.points.settled.used.any()):
+        turn, shift = align_complex(fit.places, onto.poses[:, 0] + 1j * onto.poses[:, 1])
+        frame = RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
     return _result(fit, held, frame, diagnostics)
 
 
@@ -166,12 +168,6 @@ def _check_certificate(fit: MapFit) -> None:
         f'the best directions found are not proven to be optimal {value}: the odometry contradicts '
         'the images; check odometry and gyroscope, or drive more'
     )
-
-
-def _frame_of(other: MetricResult, fit: MapFit) -> RigidTransform:
-    """From the fit's arbitrary frame to that of another result of the same segments."""
-    turn, shift = align_complex(fit.places, other.poses[:, 0] + 1j * other.poses[:, 1])
-    return RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
 
 
 def _result(

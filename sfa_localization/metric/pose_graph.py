@@ -42,8 +42,6 @@ _ROUNDS = 3
 _ORIGIN_PRIOR, _DIRECTION_PRIOR = 1e-8, 1e-3
 # Newton's steps, halvings of a step, and the decrease of the cost that ends them.
 _STEPS, _HALVINGS, _CONVERGED = 100, 20, 1e-8
-# Columns that are solved for at a time: memory.
-_BATCH = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +119,7 @@ class Graph:
 
     def covariance_times(self, columns: Array) -> Array:
         """The covariance (P, P) times columns (P, K)."""
-        product = np.empty(columns.shape)
-        for k in range(0, columns.shape[1], _BATCH):
-            part = np.ascontiguousarray(columns[:, k : k + _BATCH])
-            product[:, k : k + _BATCH] = self.factor.solve(part)
-        return product
+        return np.asarray(self.factor.solve(np.ascontiguousarray(columns)))
 
     @property
     def angle_covariance(self) -> Array:

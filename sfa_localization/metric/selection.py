@@ -171,7 +171,8 @@ def feature_scale(features: Array, stack: Stack, count: int) -> Array:
 
 
 def choose(problem: MetricProblem, scale: Array | None = None) -> MapFit:
-    """The fit of the basis in the settings; of a Gaussian process with the best length and noise.
+    """The fit of the basis in the settings; a Gaussian process has the length and noise of the best
+    evidence or, where a graph gives the places, of the least error of held-out images.
 
     `scale` (K,) weights the features of a Gaussian process; without it, their slowness does.
     """
@@ -181,12 +182,7 @@ def choose(problem: MetricProblem, scale: Array | None = None) -> MapFit:
         return problem.fit(Monomials.fit(problem.features, count, RIDGE))
     if scale is None:
         scale = feature_scale(problem.features, problem.stack, asked or available)
-    return _choose_process(problem, scale)
-
-
-def _choose_process(problem: MetricProblem, scale: Array) -> MapFit:
-    """Length and noise by the evidence, or, where places are given, by the error of held-out
-    images; the search has fewer inducing points."""
+    # Length and noise, with fewer inducing points.
     scaled = problem.features[:, : len(scale)] * scale
     points = scaled[spread(scaled, min(_SEARCH_POINTS, INDUCING_POINTS))]
 
