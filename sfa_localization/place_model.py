@@ -100,7 +100,7 @@ class PlaceModel:
         return [self.observed(view, self.located(view, Conditions())) for view in views]
 
     def views(self, panoramas: Image) -> list[View]:
-        """Views of panoramas (T, H, W, 3), leveled by keyframes."""
+        """Textures of panoramas (T, H, W, 3), leveled by keyframes."""
         require_size(panoramas, self.network.architecture)
         level = [upright(self.keyframes, image) for image in panoramas]
         maps = self.network.maps(np.stack([image.panorama for image in level]))

@@ -114,27 +114,27 @@ def test_a_map_of_weak_images_keeps_the_shape_of_its_odometry_and_says_how_weak(
 
 
 @pytest.mark.parametrize('length', [0.1, 1e4])
-def test_a_drive_shorter_than_what_is_left_out_is_left_out_in_parts(length, monkeypatch):
+def test_a_drive_shorter_than_a_held_out_stretch_is_held_out_in_parts(length, monkeypatch):
     _, segments, features, usual = legs()
     quick_and_tolerant(monkeypatch)
-    monkeypatch.setattr(selection, 'LEFT_OUT_LENGTH_M', length)
+    monkeypatch.setattr(selection, 'HELD_OUT_LENGTH_M', length)
     stack = Stack.of(segments)
-    assert 2 <= len(np.unique(folds(stack, 0))) <= selection.LEFT_OUT_FOLDS
+    assert 2 <= len(np.unique(folds(stack, 0))) <= selection.HELD_OUT_FOLDS
     result = learn_metric(features, segments, CONFIG)
     assert result.certificate.certified
     assert np.isfinite(result.map.predict(features)[1]).all()
-    assert result.left_out_error_m < 2.0
+    assert result.held_out_error_m < 2.0
     frame = RigidTransform(1.0, 2.0, -0.5)
     (x, y, error), moved = usual.forecast.worst, usual.forecast.moved(frame).worst
     assert moved == pytest.approx([*frame.apply(np.array([[x, y]]))[0], error])
 
 
-def test_few_segments_are_never_left_out_all_at_once_and_one_is_refused(monkeypatch):
+def test_few_segments_are_never_held_out_all_at_once_and_a_single_segment_is_refused(monkeypatch):
     run = drive(lanes(8.0, 1.0, 4))
     segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
-    monkeypatch.setattr(selection, 'LEFT_OUT_LENGTH_M', 1e4)
+    monkeypatch.setattr(selection, 'HELD_OUT_LENGTH_M', 1e4)
     for many, number in ((2, 2), (3, 8), (5, 2)):
-        monkeypatch.setattr(selection, 'LEFT_OUT_FOLDS', number)
+        monkeypatch.setattr(selection, 'HELD_OUT_FOLDS', number)
         few = Stack.of(replace(segments, items=segments.items[:many]))
         assert len(np.unique(folds(few, 0))) >= 2
     with pytest.raises(DataError, match='drive farther'):

@@ -13,8 +13,10 @@ from sfa_localization.data.geometry import align
 from sfa_localization.metric.basis import Process
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.map_fit import MetricProblem
+from sfa_localization.metric.pose_graph import derivative
 from sfa_localization.metric.segments import cut
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.metric.stack import SegmentPoses
 
 
 def worse(segments, factor, seed=0):
@@ -100,17 +102,26 @@ def test_links_without_weight_stay_without(names):
     assert np.isinf(getattr(links, without)).all() and np.isfinite(getattr(links, other)).all()
 
 
-def test_a_yaw_rate_bias_turns_the_paths_of_the_form():
-    """z^H H z is the cost of paths at the bias b: y^H G y of y = [o, z, -b z], at the best o."""
+def test_the_gram_is_what_eq_1_costs_at_the_best_map():
+    """And Newton's derivatives are those of the cost of poses and biases."""
     _, segments, features = recorded()
-    none = {'turn_variance': np.inf, 'displacement_variance': np.inf}
-    unlinked = tuple(dataclasses.replace(item, **none) for item in segments)
-    fit = solved(dataclasses.replace(segments, items=unlinked), features)
-    form, rng = fit.form(fit.ridge), np.random.default_rng(0)
-    x, bias = rng.normal(size=(2, len(form.period))), rng.normal(size=form.period[-1] + 1)
-    z, gram = x[0] + 1j * x[1], fit.ridge.gram(fit.stack)
-    system, c = form.at(bias), np.concatenate([z, -bias[form.period] * z])
-    y = np.concatenate([form.origins @ c, c])
-    assert np.allclose(system, system.conj().T)
-    assert np.vdot(z, system @ z).real == pytest.approx(np.vdot(y, gram @ y).real)
-    assert np.allclose((gram @ y)[: len(z)], 0.0, atol=1e-6)
+    fit, rng = solved(segments, features), np.random.default_rng(0)
+    stack, n, ridge = fit.stack, fit.stack.segments, fit.ridge
+    bias = 1e-3 * rng.normal(size=stack.period[-1] + 1)
+    z = np.exp(1j * rng.uniform(-3, 3, n))
+    poses = SegmentPoses(z, rng.normal(size=(n, 2)) @ [1, 1j], bias)
+    places, y = poses.places(stack), poses.coefficients(stack.period)
+    weights = ridge.fitted(places)
+    residuals = places - ridge.expanded @ weights
+    prior = ridge.basis.ridge @ np.abs(weights) ** 2
+    total = ridge.weights @ np.abs(residuals) ** 2 + prior
+    assert np.vdot(y, ridge.gram(stack) @ y).real == pytest.approx(total)
+    by, small = derivative(poses, stack.period), 1e-6
+    for column, (turned, moved) in ((2 * n + 3, (1, 0)), (3, (0, 1))):
+        step = small * (np.arange(n) == 3)
+        other = SegmentPoses(z * np.exp(1j * turned * step), poses.o + moved * step, bias)
+        change = (other.coefficients(stack.period) - y) / small
+        np.testing.assert_allclose(by[:, [column]].toarray()[:, 0], change, atol=1e-4)
+    other = SegmentPoses(z, poses.o, bias + small * (np.arange(len(bias)) == 0))
+    change = (other.coefficients(stack.period) - y) / small
+    np.testing.assert_allclose(by[:, [3 * n]].toarray()[:, 0], change, atol=1e-4)

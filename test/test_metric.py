@@ -23,12 +23,12 @@ from metric_worlds import (
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import RigidTransform, align, compose, invert, wrap_angle
 from sfa_localization.data.statistics import share_within
-from sfa_localization.metric import map_fit, paper_solver, selection
+from sfa_localization.metric import paper_solver, pose_graph, selection
 from sfa_localization.metric.basis import expand, missing, monomials
 from sfa_localization.metric.learning import learn_metric
 from sfa_localization.metric.map_fit import MetricProblem
 from sfa_localization.metric.paper_solver import Lines, mirrored, odometry_start
-from sfa_localization.metric.phases import Certificate
+from sfa_localization.metric.pose_graph import Certificate
 from sfa_localization.metric.segments import assignment, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Stack
@@ -105,7 +105,7 @@ def test_noiseless_data_gives_no_error(mode):
     assert result.certificate.certified
     assert np.abs(result.residuals).max() < 1e-9
     # A left-out segment that nothing links is held by rounding alone.
-    assert result.left_out_error_m < 1e-7
+    assert result.held_out_error_m < 1e-7
 
 
 @pytest.mark.parametrize('kind', ['straight', 'any'])
@@ -227,9 +227,9 @@ def test_what_positions_have_in_common_errors_is_about_as_large_as_they_err():
     assert 0.55 < np.sqrt(np.mean(claimed) / np.mean(true)) < 1.3
 
 
-def test_left_out_segments_calibrate_the_covariance():
+def test_held_out_segments_calibrate_the_covariance():
     result = noisy_result()[3]
-    ratio = (result.left_out**2).sum(1) / result.left_out_variance
+    ratio = (result.held_out**2).sum(1) / result.held_out_variance
     for share, slack in ((0.5, 1e-3), (0.95, 2e-3)):
         assert share_within(ratio, share, result.forecast.weight) >= share - slack
 
@@ -308,7 +308,7 @@ def test_unusable_features_are_named():
 
 def test_an_unproven_map_is_rejected(monkeypatch):
     """Odometry that contradicts the images so is hard to make; the proof is taken away."""
-    monkeypatch.setattr(map_fit, 'certify', lambda h, z: Certificate(-1.0))
+    monkeypatch.setattr(pose_graph, 'proof', lambda *_: Certificate(-1.0))
     run = lines_drive()
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     with pytest.raises(DataError, match='not proven to be optimal'):
@@ -334,5 +334,5 @@ def test_the_papers_cosine_cannot_tell_a_mirror_image_but_the_signs_can():
     )
     config = dataclasses.replace(EXACT, solver='paper')
     fit = paper_solver.learn(MetricProblem.of(exact_features(run.poses), flipped, config))
-    step = np.diff(np.angle(fit.solution.z))
+    step = np.diff(np.angle(fit.graph.poses.z))
     assert np.cos(step - turns).mean() > 0.99

@@ -71,7 +71,7 @@ def learned(twists, start, cameras, mount=None, aside=0.0):
 @pytest.mark.parametrize('lever', [LEVER, 0j, -0.6 + 0.1j])
 def test_the_place_of_the_camera_is_learned_with_the_graph(lever):
     mount, graph, poses = learned(*meander(150.0), [lambda base: camera_poses(base, lever)])
-    error, std = abs(mount.lever - lever), np.sqrt(np.diag(mount.known)[:2])
+    error, std = abs(mount.lever - lever), np.sqrt(np.diag(mount.uncertainty)[:2])
     assert error < 0.04 and error < 3 * np.hypot(*std) and np.all(std < 0.1)
     assert graph.certificate.certified
     stack, found = graph.stack, graph_poses(graph, len(poses))
@@ -83,7 +83,7 @@ def test_the_place_of_the_camera_is_learned_with_the_graph(lever):
 def test_a_drive_that_turns_nowhere_shows_no_place_of_the_camera():
     """All images of a place are taken at one heading: any lever only moves the map."""
     mount, _, _ = learned(straight(12.0), (0.0, 0.0, 0.0), [camera_poses] * 4, aside=0.3)
-    assert np.all(np.sqrt(np.diag(mount.known)[:2]) > CAMERA_STD_M / 2)
+    assert np.all(np.sqrt(np.diag(mount.uncertainty)[:2]) > CAMERA_STD_M / 2)
     assert abs(mount.lever) < 0.2
 
 
@@ -98,7 +98,7 @@ def test_a_camera_that_was_turned_between_two_drives_is_learned():
     cameras = [camera_poses, lambda base: camera_poses(base, yaw=turned)]
     mount, graph, _ = learned(*meander(120.0), cameras)
     assert mount.yaw[0] == 0.0 and mount.yaw[1] == pytest.approx(turned, abs=np.radians(1.0))
-    assert abs(mount.lever - LEVER) < 0.02 and graph.certificate.certified
+    assert abs(mount.lever - LEVER) < 0.03 and graph.certificate.certified
     assert mount.quantities['camera_yaw'].std == UNKNOWN_YAW_STD
 
 
@@ -247,7 +247,7 @@ def test_a_place_that_the_images_contradict_is_named():
     wrong = Mount.at(-0.5 + 0j)
     mount, _, _ = learned(*meander(150.0), [camera_poses], wrong)
     assert abs(mount.lever + 0.5) < 0.1
-    assert 'said to sit -0.50 m ahead' in mount.contradiction
+    assert 'stated to be -0.50 m ahead' in mount.contradiction
     assert abs(mount.learned[0] - LEVER) < 0.1
     assert not learned(*meander(150.0), [camera_poses], Mount.at(LEVER))[0].contradiction
 

@@ -118,7 +118,7 @@ def test_saved_maps_and_single_rows_predict_alike_and_what_is_missing_is_named(m
     again = MetricMap.from_arrays(metric_map.to_arrays())
     positions, covariances = metric_map.predict(FEATURES)
     for a, b in zip((positions, covariances), again.predict(FEATURES), strict=True):
-        assert np.array_equal(a, b)
+        assert np.allclose(a, b, rtol=1e-9)
     position, covariance = metric_map.predict(FEATURES[7])
     assert np.allclose(position[0], positions[7], atol=1e-9)
     assert np.allclose(covariance[0], covariances[7], rtol=1e-3)

@@ -7,12 +7,11 @@ drives            odometry of all drives, corrected by what images show, cut, le
   motion_check, motion_sources     whether all sources of a drive tell the same motion
   dead_reckoning, odometry_errors, segments     odometry, corrected, in rigid pieces
 learning          the map of segments and features, of slow ones and of turned maps
-  stack              the unknowns, [o, z, -b z]: origins, directions and yaw-rate biases
-  links, loops, measured_points     rows of them: odometry, loop closures, measured points
-  pose_graph         where closures or points tie a drive: sparse, certified
-  quadratic_form, phases    where nothing does: from eq. 1 with the map, dense, certified
+  stack              the images, and the unknown poses of segments and yaw-rate biases
+  links, loops, measured_points     residuals of odometry, offsets, measured points
+  pose_graph         the poses, by these residuals and eq. 1, certified
   paper_solver       the descent of the paper, for comparison
-  basis, map_fit, selection     the map: regression, evidence, parts left out
+  basis, ridge, map_fit, selection     the map: regression, evidence, held-out parts
   drive_check, forecast, fitted_map, saved_map     what it is worth, and what models save
 turned_maps, keyframe_map     the map and keyframes that a model locates images by
 """

@@ -1,10 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a map is linear in: monomials (section 4 of the paper), or a Gaussian process.
+"""The basis of a map: monomials (section 4 of the paper), or a Gaussian process.
 
 The paper estimates p = W^T s (section 3). Both are linear in an expansion phi(s), position = Phi w,
-with a Gaussian prior on w. A Gaussian process is its expansion over the training features
-themselves, so one solver serves both.
+with a Gaussian prior on w. The expansion of a Gaussian process is its kernel at training features.
 """
 
 from __future__ import annotations
@@ -29,17 +28,13 @@ def expand(basis: Basis, features: Array) -> Array:
 
 
 def missing(basis: Basis, expanded: Array) -> Array:
-    """(M,) prior variance that an expansion leaves out, over a point's variance."""
-    held = np.einsum('ij,ij->i', expanded[:, :-1], expanded[:, :-1])
-    return np.asarray(np.maximum(1.0 - held, 0.0) * basis.prior)
+    """(M,) prior variance that an expansion lacks, over a point's variance."""
+    return np.asarray(np.maximum(1.0 - np.square(expanded[:, :-1]).sum(1), 0.0) * basis.prior)
 
 
 @dataclass(frozen=True, slots=True)
 class Monomials:
-    """All monomials up to degree 2 of the slowest K features; 45 for the paper's K = 8.
-
-    The monomials are rotated to orthonormal columns: the same functions, well conditioned.
-    """
+    """All monomials up to degree 2 of the slowest K features, rotated to orthonormal columns."""
 
     center: Array
     """(k,) mean of the monomials."""
@@ -85,8 +80,7 @@ def monomials(features: Array) -> Array:
 class Process:
     """A Gaussian process with a Matern 5/2 kernel of unit variance and a free constant mean.
 
-    It is spanned by m inducing points chosen among the training features; all of them when m
-    allows, and then it is the exact process. Points are rounded as model files hold them.
+    It is spanned by m inducing points among the training features; by all of them, it is exact.
     """
 
     scale: Array
@@ -95,9 +89,6 @@ class Process:
     """(m, K) scaled inducing features."""
     noise: float
     """Variance of a point over the process's variance."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, 'points', self.points.astype(np.float32).astype(np.float64))
 
     @cached_property
     def turn(self) -> Array:
@@ -111,9 +102,11 @@ class Process:
 
     @classmethod
     def fit(cls, features: Array, scale: Array, noise: float, size: int) -> Process:
-        """On features (M, >= K), scaled by `scale` (K,), with at most `size` inducing points."""
+        """On features (M, >= K), scaled by `scale` (K,), with at most `size` inducing points, which
+        are rounded as in model files."""
         scaled = np.asarray(features[:, : len(scale)], float) * scale
-        return cls(np.asarray(scale, float), scaled[spread(scaled, size)], noise)
+        points = scaled[spread(scaled, size)].astype(np.float32).astype(float)
+        return cls(np.asarray(scale, float), points, noise)
 
     @property
     def features(self) -> int:
@@ -136,16 +129,15 @@ class Process:
 
 
 Basis = Monomials | Process
-"""An expansion of features, phi(s) = [k(s) turn, 1], of the slowest K = `features`: `kernel` gives
-k(s) (M, k), and `turn` is (k, m - 1). `ridge` (m,) is the prior precision of each weight over that
-of a point, `prior` the prior variance of a position over that of a point; 0 where there is none.
-"""
+"""phi(s) = [k(s) turn, 1] of the slowest K = `features`: `kernel` gives k(s) (M, k), and `turn` is
+(k, m - 1). `ridge` (m,) is the prior precision of each weight over that of a point, `prior` the
+prior variance of a position over that of a point, 0 without a prior."""
 
 
 def basis_from(arrays: Arrays) -> Basis:
     """The basis of saved arrays. Raises KeyError when an array is missing."""
     if 'points' in arrays:
-        return Process(arrays['scale'], arrays['points'], float(arrays['noise']))
+        return Process(arrays['scale'], arrays['points'].astype(float), float(arrays['noise']))
     return Monomials(arrays['center'], arrays['turn'], arrays['ridge'], int(arrays['features']))
 
 

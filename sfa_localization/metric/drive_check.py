@@ -11,7 +11,6 @@ import numpy as np
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.data.statistics import quantile
-from sfa_localization.metric.fitted_map import angle_covariance
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.map_fit import MapFit
 from sfa_localization.metric.stack import Stack
@@ -71,7 +70,7 @@ def diagnose(fit: MapFit) -> Diagnostics:
     """Diagnostics of a fit."""
     places, stack = fit.places, fit.stack
     lengths, same = stack.sums(stack.steps), np.diff(stack.owner, prepend=-1) == 0
-    heading = (np.diff(stack.path, prepend=0.0) * fit.solution.z[stack.owner])[same]
+    heading = (np.diff(stack.path, prepend=0.0) * fit.graph.poses.z[stack.owner])[same]
     return Diagnostics(
         segments=stack.segments,
         images=len(places),
@@ -79,7 +78,7 @@ def diagnose(fit: MapFit) -> Diagnostics:
         extent_m=_extent(places),
         directions=_directions(heading),
         crossings=_crossings(places, stack.first),
-        angle_std_rad=quantile(np.sqrt(np.diag(angle_covariance(fit))), SURE_SHARE, lengths),
+        angle_std_rad=quantile(np.sqrt(np.diag(fit.graph.angle_covariance)), SURE_SHARE, lengths),
     )
 
 

@@ -25,7 +25,7 @@ from sfa_localization.keyframes.turning import lever_square
 from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import MetricResult, learn_metric
-from sfa_localization.metric.loops import with_closures
+from sfa_localization.metric.loops import rough_offsets, with_closures
 from sfa_localization.metric.measured_points import MeasuredPoints, Settled, settle
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.motion_sources import compare_map
@@ -130,6 +130,7 @@ class Drives:
         turns = np.concatenate([each.track for each in headings])[views.images]
         mount = replace(self.mount, turning=lever_square(views, turns))
         drives, count = replace(self, mount=mount), int(views.images.max()) + 1
+        drives = replace(drives, offsets=rough_offsets(drives.cut().closures))
         for _ in range(_MOUNT_ROUNDS):
             before = drives.mount
             drives = replace(drives, mount=Graph.of(drives.cut()).mount)

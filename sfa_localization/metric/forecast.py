@@ -1,14 +1,14 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The error to expect of one image on a path between the trained ones; needs no ground truth.
+"""The error to expect of one image on a path between the trained ones, without ground truth.
 
-A stretch of the drive that is left out is usually farther from all other images than a path of
-later use: legs end at the border, and a lane is alone in its strip. So left-out images are weighted
-until as many of them are at each distance from the nearest image that their map was learned from
-as points drawn evenly over the covered ground are from any.
+A stretch of the drive that is held out is usually farther from all other images than later paths
+are: legs end at the border, and a lane is alone in its strip. So held-out images are weighted,
+until their distances to the nearest image that their map was learned from are distributed as those
+of points drawn evenly over the covered ground.
 
-It does not contain what no left-out image can show: other light than that of the trained drives,
-or a wheel radius that is wrong everywhere.
+The forecast contains no error that a held-out image cannot show: that of another light than in the
+trained drives, or of a wheel radius that is wrong everywhere.
 """
 
 from __future__ import annotations
@@ -21,12 +21,9 @@ from scipy.spatial import ConvexHull, cKDTree
 from sfa_localization.data.geometry import Array, Indices, RigidTransform
 
 REACH_M = 1.0
-"""Ground further than this from every image is not covered by the drive."""
-_NARROW_M = 0.1
-# Points on the ground: enough for the shares of distances.
-_POINTS = 1000
-# Of distances, in which left-out images are weighted.
-_BINS = 12
+"""Ground farther than this from every image is not covered by the drive."""
+# Points on the ground, and bins of their distances.
+_POINTS, _BINS = 1000, 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,19 +32,19 @@ class Forecast:
 
     places: Array
     """(M, 2) m, in the map frame."""
-    left_out: Array
-    """(M,) m: errors of a map without that stretch of the drive."""
+    held_out: Array
+    """(M,) m: errors of a map learned without that stretch of the drive."""
     drive_std: Array
-    """(M,) m: of the drive's own positions there, which a map repeats."""
+    """(M,) m: of the positions of the drive there, which a map repeats."""
     weight: Array
-    """(M,) of sum 1: how well each of `left_out` represents paths between the trained ones."""
+    """(M,) of sum 1: by which `held_out` represents paths between the trained ones."""
     distances: Array
     """(K,) m to the nearest image, of points drawn evenly over the covered ground."""
 
     @property
     def errors(self) -> Array:
-        """(M,) m: of left-out images and of the drive together."""
-        return np.hypot(self.left_out, self.drive_std)
+        """(M,) m: of held-out images and of the drive together."""
+        return np.hypot(self.held_out, self.drive_std)
 
     @property
     def expected_m(self) -> float:
@@ -58,7 +55,7 @@ class Forecast:
     def local(self) -> Array:
         """(M,) m: mean of the errors within `REACH_M` of each place, by weight."""
         near = cKDTree(self.places).query_ball_point(self.places, REACH_M)
-        weight = self.weight + 1e-2 / len(self.weight)  # where none has any, all count
+        weight = self.weight + 1e-2 / len(self.weight)  # near some places none has any
         return np.array([np.average(self.errors[n], weights=weight[n]) for n in near])
 
     @property
@@ -69,8 +66,8 @@ class Forecast:
         return float(self.places[at, 0]), float(self.places[at, 1]), float(local[at])
 
     def improved(self, share: float) -> Forecast:
-        """With this share of the left-out errors; nothing learned from a drive improves its own."""
-        return replace(self, left_out=share * self.left_out)
+        """With this share of the held-out errors; those of the drive stay."""
+        return replace(self, held_out=share * self.held_out)
 
     def moved(self, frame: RigidTransform) -> Forecast:
         """The same forecast in another frame."""
@@ -78,17 +75,23 @@ class Forecast:
 
 
 def ground_distances(places: Array, rng: np.random.Generator) -> Array:
-    """Distance (K,) m to the nearest of the places (M, 2), of points drawn evenly over the ground
-    that they cover.
-    """
-    return np.asarray(cKDTree(places).query(_covered(places, rng))[0])
+    """Distances (K,) m to the nearest of the places (M, 2), of points drawn evenly over the ground
+    that they cover: inside their hull, and within REACH_M."""
+    centered = places - places.mean(0)
+    local = centered @ np.linalg.svd(centered, full_matrices=False)[2].T
+    hull = ConvexHull(local, qhull_options='QJ').equations  # also of a straight line
+    tree, distances = cKDTree(local), np.zeros(0)
+    while len(distances) < _POINTS:
+        points = rng.uniform(local.min(0), local.max(0), (4 * _POINTS, 2))
+        inside = np.all(points @ hull[:, :2].T + hull[:, 2] <= 1e-6, axis=1)
+        nearest = tree.query(points[inside])[0]
+        distances = np.append(distances, nearest[nearest <= REACH_M])
+    return distances[:_POINTS]
 
 
 def importance(near: Array, distances: Array) -> Array:
-    """Weights (M,), of sum 1, of left-out images so `near` (M,), m, to the nearest used one.
-
-    As many, by weight, are then at each distance as `distances` (K,) of points of the ground are.
-    """
+    """Weights (M,), of sum 1, of held-out images at distances `near` (M,), m, from the nearest used
+    one, so that their distribution is that of `distances` (K,) of points of the ground."""
     edges = np.quantile(distances, np.linspace(0.0, 1.0, _BINS + 1))
     edges[0] = 0.0
     bins = np.searchsorted(edges, near, 'right') - 1
@@ -102,36 +105,11 @@ def importance(near: Array, distances: Array) -> Array:
 
 
 def nearest_used(places: Array, part: Indices) -> Array:
-    """Distance (M,) m from each place (M, 2) to the nearest one of another part (M,).
-
-    Infinite where there is no other part.
-    """
+    """Distance (M,) m from each place (M, 2) to the nearest one of another part (M,); infinite
+    where there is none."""
     distances = np.full(len(places), np.inf)
-    for name in np.unique(part):
-        own = part == name
-        if not own.all():
-            distances[own] = cKDTree(places[~own]).query(places[own])[0]
+    for number in np.unique(part):
+        inside = part == number
+        if not inside.all():
+            distances[inside] = cKDTree(places[~inside]).query(places[inside])[0]
     return distances
-
-
-def _covered(places: Array, rng: np.random.Generator) -> Array:
-    """Points (K, 2) drawn evenly inside the hull of the places (M, 2), and near one of them."""
-    center = places.mean(0)
-    axes = np.linalg.svd(places - center, full_matrices=False)[2]
-    along, across = (places - center) @ axes.T[:, 0], (places - center) @ axes.T[:, 1]
-    if np.ptp(across) < _NARROW_M:
-        # One straight route has hardly a hull: the ground that it covers is its line.
-        spots = rng.uniform(along.min(), along.max(), (4 * _POINTS, 1))
-        line = center + spots * axes[0]
-        near = cKDTree(places).query(line)[0] <= REACH_M
-        return np.asarray(line[near][:_POINTS])
-    hull = ConvexHull(places)
-    normals, offsets = hull.equations[:, :2], hull.equations[:, 2]
-    tree = cKDTree(places)
-    low, high = places.min(0), places.max(0)
-    found: list[Array] = []
-    while sum(len(points) for points in found) < _POINTS:
-        points = rng.uniform(low, high, (4 * _POINTS, 2))
-        points = points[np.all(points @ normals.T + offsets <= 0.0, axis=1)]
-        found.append(points[tree.query(points)[0] <= REACH_M])
-    return np.concatenate(found)[:_POINTS]

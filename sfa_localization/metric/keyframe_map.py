@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes at the places of the certified map, and how well they and slow features do together."""
+"""Keyframes at the places of the map, and the errors of keyframes and slow features together."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from sfa_localization.metric.learning import MetricResult
 from sfa_localization.metric.segments import Segments, assignment
 from sfa_localization.metric.stack import Stack, tracks
 
-# Between the drives: farther than any stretch.
+# Distance between drives: longer than any stretch.
 _ANOTHER_DRIVE_M = 1e6
+# Fewest held-out images for statistics.
 _ENOUGH = 50
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeMap:
-    """Keyframes of a map; from images that both were learned without: `improvement`, the mean error
-    of slow features and keyframes together over that of slow features alone, `within_95`, the share
-    of errors in the ellipses of 95 %, `yaw_error`, the mean error of headings, rad, and how errors
-    of neighbors correlate.
-    """
+    """Keyframes of a map, and figures of held-out images: `improvement`, the mean error of slow
+    features and keyframes together over that of slow features alone, `within_95`, the share of
+    errors in the ellipses of 95 %, `yaw_error`, the mean error of headings, rad, and the
+    correlation of the errors of neighbors."""
 
     keyframes: Keyframes
     improvement: float = 1.0
@@ -53,9 +53,8 @@ class KeyframeMap:
 def learn_keyframes(
     views: Textures, segments: Segments, result: MetricResult, sphere: Sphere, turn_radius_m: float
 ) -> KeyframeMap:
-    """Keyframes where the certified solution puts the images of `views`; along the drive a turn
-    counts as `turn_radius_m` per rad. Raises DataError for too few.
-    """
+    """Keyframes of the images of `views`, where the segments put them; along the drive a turn
+    counts as `turn_radius_m` per rad. Raises DataError for too few images."""
     _, seen, row = np.intersect1d(views.images, result.images, return_indices=True)
     poses, drives = result.poses[row], views.run[seen].astype(np.int32)
     keyframes, kept = choose_keyframes(views.textures[seen], poses, sphere, drives)
@@ -67,7 +66,7 @@ def learn_keyframes(
     poses, rows = keyframes.poses[tried], rows[tried]
     ground_m = ground_distances(keyframes.poses[:, :2], np.random.default_rng(0))
     trials = LeftOut.of(fits, poses, importance(near_m, ground_m))
-    slow, claimed = result.left_out[rows], result.left_out_variance[rows]
+    slow, claimed = result.held_out[rows], result.held_out_variance[rows]
     errors = trials.learn_slow(trials.learn(), slow, claimed)
     both, variance = trials.fused(errors, slow, claimed)
     weight, driven, owner = trials.weight, *_driven(segments, turn_radius_m)
@@ -82,7 +81,7 @@ def learn_keyframes(
 
 
 def _driven(segments: Segments, turn_radius_m: float) -> tuple[Array, Indices]:
-    """Of the images of all segments the distance driven until each, (M,) m, and the segment."""
+    """The distance driven until each image of the segments, (M,) m, and its segment."""
     stack = Stack.of(segments)
     turns = np.abs(np.diff(stack.headings, prepend=0.0))
     turns[stack.first] = 0.0
@@ -90,15 +89,14 @@ def _driven(segments: Segments, turn_radius_m: float) -> tuple[Array, Indices]:
 
 
 def usual_turn_std(covariance: Array) -> float:
-    """Standard deviation rad of a map's directions, by those of its N segments, (N, N) rad^2: one
-    that hardly anything ties to the others is no matter of the map as a whole.
-    """
+    """Standard deviation, rad, of a map's directions with covariance (N, N) rad^2: the median, as a
+    segment that is hardly tied to the others says nothing of the map."""
     return float(np.sqrt(np.median(np.diag(covariance))))
 
 
 def _along_tracks(views: Textures, segments: Segments) -> Array:
-    """Distance (S,) m driven until each image, far apart between drives; of a segment along an
-    earlier track it is that of the earlier one."""
+    """Distance (S,) m driven until each image, with a large step between drives; for a segment
+    along an earlier track, that of the earlier one."""
     path = views.path_m + _ANOTHER_DRIVE_M * views.run
     owner = assignment(segments, int(views.images.max()) + 1)[views.images]
     for n, first in enumerate(tracks(segments).tolist()):

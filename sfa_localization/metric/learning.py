@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Unsupervised metric learning: meters from slow features and odometry, section 3 of the paper.
 
-Where closures or points tie a drive, its places are those of a sparse graph (pose_graph.py), and
-the map is a regression to them. Else the certified solver finds the global optimum of the paper's
-problem; the paper's own descent is in paper_solver.py. Complex numbers are x + i y in meters.
+Where offsets or points tie a drive, its places are those of a sparse graph (pose_graph.py), and the
+map is a regression to them. Else the same solver finds both by eq. 1; the paper's own descent is in
+paper_solver.py. Complex numbers are x + i y in meters.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from sfa_localization.data.statistics import evenly
 from sfa_localization.metric import paper_solver
 from sfa_localization.metric.drive_check import Diagnostics, check, check_amount, diagnose
 from sfa_localization.metric.fitted_map import (
-    angle_covariance,
     map_frame,
     metric_map,
     places_of_points,
@@ -37,11 +36,10 @@ from sfa_localization.metric.fitted_map import (
 from sfa_localization.metric.forecast import Forecast
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.mount import Mount
-from sfa_localization.metric.phases import Certificate, certify, refine
-from sfa_localization.metric.pose_graph import Graph
+from sfa_localization.metric.pose_graph import Certificate, Graph
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.selection import LeftOut, choose, leave_out
+from sfa_localization.metric.selection import HeldOut, choose, hold_out
 from sfa_localization.metric.settings import MetricConfig
 from sfa_localization.metric.turned_maps import TurnedMaps
 from sfa_localization.sfa.image_features import Spectrum
@@ -49,7 +47,7 @@ from sfa_localization.sfa.image_features import Spectrum
 logger = logging.getLogger(__name__)
 
 LITTLE, OVERFIT = 0.9, 4.0
-"""Where features explain less than this share of the places of images left out, whose variance is
+"""Where features explain less than this share of the places of images held out, whose variance is
 so many times that of the others, a map follows noise: it leaves no residuals, and would bend the
 drive as it likes. Then the drive keeps the shape of its odometry."""
 # Images that the components are found from, evenly along the drives: they are smooth statistics.
@@ -60,47 +58,46 @@ _BATCH = 1000
 
 @dataclass(frozen=True, slots=True)
 class MetricResult:
-    """What was learned of N segments, M images in them, R periods. All in the map frame."""
+    """The map of N segments with M images and R periods, all in the map frame."""
 
     map: MetricMap
     poses: Array
-    """(M, 3) x m, y m, yaw rad of the camera: where the certified solution puts `images`."""
+    """(M, 3) x m, y m, yaw rad of the camera at `images`, by the segments."""
     angle_covariance: Array
     """(N, N) rad^2, of the directions of the segments."""
     yaw_bias: Array
-    """(R,) rad/s: by how much the odometry turned too fast in each period."""
+    """(R,) rad/s, of the odometry in each period."""
     certificate: Certificate
-    """Of the directions; the paper's descent seldom ends close enough to have one."""
+    """Of the directions; of the paper's descent that of the minimum near which it ended."""
     images: Indices
     """(M,) images of the segments, in order."""
     residuals: Array
     """(M, 2) m: where the segments put an image minus where the map does."""
-    left_out: Array
-    """(M, 2) m: as `residuals`, of a map learned without that stretch of the drive."""
-    left_out_variance: Array
-    """(M,) m^2 per axis: what the map claimed for `left_out`, with its inflation."""
+    held_out: Array
+    """(M, 2) m: `residuals` of maps learned without that part of the drive."""
+    held_out_variance: Array
+    """(M,) m^2 per axis, of `held_out` by the map, inflated."""
     explained: float
-    """Share of the spread of the places that the features explain in images left out."""
+    """Share of the spread of the places that the features explain in held-out images."""
     forecast: Forecast
     """Errors to expect on paths between the trained ones."""
     points: Complex
-    """(K,) x + i y m: where the drive puts the robot at measured points."""
+    """(K,) x + i y m: where the segments put the robot at measured points."""
     points_covariance: Complex
-    """(K, K) m^2 per axis, without a motion of the whole map."""
+    """(K, K) m^2 per axis, relative to the whole map."""
     diagnostics: Diagnostics
     graph: Graph | None
-    """That gave the places, instead of features."""
+    """That gave the places without features."""
     mount: Mount
     """Where the camera sits on the robot."""
 
     @property
-    def left_out_error_m(self) -> float:
-        """Mean error of a map at stretches of the drive that it was learned without.
+    def held_out_error_m(self) -> float:
+        """Mean error of maps at parts of the drive that they were learned without.
 
-        The distance to where the certified solution of all data puts the stretch; needs no ground
-        truth. Most stretches lie beyond the others: `forecast` is about paths between them.
+        Most parts lie beyond the others: `forecast` is about paths between them.
         """
-        return float(np.hypot(*self.left_out.T).mean())
+        return float(np.hypot(*self.held_out.T).mean())
 
     @property
     def quality(self) -> dict[str, Any]:
@@ -112,7 +109,7 @@ class MetricResult:
             'residual_m': float(np.hypot(*self.residuals.T).mean()),
             'expected_error_m': self.forecast.expected_m,
             'worst': {'x_m': x, 'y_m': y, 'expected_error_m': error},
-            'left_out_error_m': self.left_out_error_m,
+            'left_out_error_m': self.held_out_error_m,
             'explained': self.explained,
             'coverage': asdict(self.diagnostics),
         }
@@ -128,46 +125,44 @@ def learn_metric(
 ) -> MetricResult:
     """Learn meters from features (N, K), one row per image of the runs, and segments.
 
-    `scale` (K,) weights the features, without it their slowness does. The result lies in its own
-    map frame, or in that of `onto`, another result of the same segments, where no points give it.
+    `scale` (K,) weights the features; without it, their slowness does. Where no points give a
+    frame, it is that of `onto`, another result of the same segments.
 
-    Raises DataError when the features are unusable, when the drive cannot determine a map (the
-    message names what to drive instead), or when optimality is not proven.
+    Raises DataError when the features are unusable, when the drive cannot determine a map, or when
+    optimality is not proven.
     """
     problem = MetricProblem.of(features, segments, config, seed)
     check_amount(problem.stack, problem.links)
-    tied = len(segments.closures) or len(segments.offsets.images) or segments.points
+    tied = len(segments.offsets.images) or segments.points
     if tied and config.solver == 'certified':
         problem = replace(problem, graph=(onto and onto.graph) or Graph.of(segments))
     fit = paper_solver.learn(problem) if config.solver == 'paper' else choose(problem, scale)
-    left = leave_out(fit)
-    overfits = left.explained < LITTLE and left.variance > OVERFIT * fit.variance
-    searched = config.solver == 'certified' and problem.graph is None
-    if overfits and searched and not diagnose(fit).one_route:
+    held = hold_out(fit)
+    overfits = held.explained < LITTLE and held.variance > OVERFIT * fit.variance
+    by_features = config.solver == 'certified' and problem.graph is None
+    if overfits and by_features and not diagnose(fit).one_route:
         fit = choose(replace(problem, graph=Graph.of(segments)), scale)
-        left = leave_out(fit)
+        held = hold_out(fit)
     if fit.problem.graph is not None:
-        # Neighbors err alike, and a map follows them: the variance is that of left-out images.
-        left = replace(left, variances=left.variances * (left.variance / fit.variance))
-        fit = replace(fit, variance=left.variance)
+        # Neighbors err alike, and a map follows them: the variance is that of held-out images.
+        held = replace(held, variances=held.variances * (held.variance / fit.variance))
+        fit = replace(fit, variance=held.variance)
     diagnostics = diagnose(fit)
     _check_certificate(fit)
     check(diagnostics)
-    by_points = segments.points is not None and segments.points.settled.used.any()
-    frame = map_frame(fit) if onto is None or by_points else _frame_of(onto, fit)
-    return _result(fit, left, frame, diagnostics)
+    frame = map_frame(fit)
+    if onto is not None and not (segments.points and segments.points.settled.used.any()):
+        turn, shift = align_complex(fit.places, onto.poses[:, 0] + 1j * onto.poses[:, 1])
+        frame = RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
+    return _result(fit, held, frame, diagnostics)
 
 
 def _check_certificate(fit: MapFit) -> None:
-    """Reject directions that are not proven; of the paper's descent, those near a wrong minimum."""
-    solution, certificate = fit.solution, fit.certificate
-    paper = fit.problem.config.solver == 'paper'
-    if paper:
-        certificate = certify(solution.h, refine(solution.h, solution.z))
-    if certificate.certified:
+    """Raise DataError for directions that are not proven to be the best."""
+    if fit.graph.certificate.certified:
         return
-    value = f'(certificate {certificate.eigenvalue:.1e})'
-    if paper:
+    value = f'(certificate {fit.graph.certificate.eigenvalue:.1e})'
+    if fit.problem.config.solver == 'paper':
         raise DataError(f'the descent ended in a wrong minimum {value}: set solver: certified')
     raise DataError(
         f'the best directions found are not proven to be optimal {value}: the odometry contradicts '
@@ -175,33 +170,27 @@ def _check_certificate(fit: MapFit) -> None:
     )
 
 
-def _frame_of(other: MetricResult, fit: MapFit) -> RigidTransform:
-    """From the fit's arbitrary frame to that of another result of the same segments."""
-    turn, shift = align_complex(fit.places, other.poses[:, 0] + 1j * other.poses[:, 1])
-    return RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
-
-
 def _result(
-    fit: MapFit, left: LeftOut, frame: RigidTransform, diagnostics: Diagnostics
+    fit: MapFit, held: HeldOut, frame: RigidTransform, diagnostics: Diagnostics
 ) -> MetricResult:
-    inflation = left.inflation
-    drive_std = np.sqrt(inflation) * left.forecast.drive_std
+    inflation = held.inflation
+    drive_std = np.sqrt(inflation) * held.forecast.drive_std
     common_m = float(np.sqrt((drive_std**2).mean() / 2))
     turn, shift = np.exp(1j * frame.yaw_rad), frame.x_m + 1j * frame.y_m
     points, points_covariance = places_of_points(fit)
-    yaw = fit.stack.yaws(fit.solution)
+    yaw = fit.stack.yaws(fit.graph.poses)
     return MetricResult(
         map=metric_map(fit, frame, inflation, common_m),
         poses=np.column_stack([plane(fit.places * turn + shift), wrap_angle(yaw + frame.yaw_rad)]),
-        angle_covariance=angle_covariance(fit),
-        yaw_bias=fit.solution.bias,
-        certificate=fit.certificate,
+        angle_covariance=fit.graph.angle_covariance,
+        yaw_bias=fit.graph.poses.bias,
+        certificate=fit.graph.certificate,
         images=fit.stack.images,
         residuals=plane(fit.residuals * turn),
-        left_out=plane(left.errors * turn),
-        left_out_variance=left.variances * inflation,
-        explained=left.explained,
-        forecast=replace(left.forecast, drive_std=drive_std).moved(frame),
+        held_out=plane(held.errors * turn),
+        held_out_variance=held.variances * inflation,
+        explained=held.explained,
+        forecast=replace(held.forecast, drive_std=drive_std).moved(frame),
         points=points * turn + shift,
         points_covariance=points_covariance,
         diagnostics=diagnostics,

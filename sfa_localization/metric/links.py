@@ -1,16 +1,15 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What odometry measured from one segment to the next, and how noisy it is, learned with the map.
+"""Residuals of odometry between segments, and their variances, which are learned with the map.
 
-    |z_{n+1} - exp(i (turn_n - b time_n)) z_n|^2      signed turns: the second sum of eq. 5, which
-                                                  has only cosines, the same for left and right
-    |o_{n+1} - o_n - z_n displacement_n|^2        displacements: not in the paper
+    |z_{n+1} - exp(i (turn_n - b time_n)) z_n|^2   signed turns: the second sum of eq. 5, which has
+                                                   only cosines, the same for left and right
+    |o_{n+1} - o_n - z_n displacement_n|^2         displacements: not in the paper
 
-each over its variance, turns to first order in the biases. What messages state of their noise, or
-data sheets, is of wheels on a good floor. Where the links of a drive miss its solution by more than
-that, their variances grow. They miss it by less than they err, because it follows them: a link has
-as much of a degree of freedom left as the solution's own uncertainty of it is smaller than its
-variance.
+each over its variance, turns to first order in the biases. Messages and data sheets state noise of
+wheels on a good floor. Where residuals are larger, the variances of the drive grow. A solution
+follows its links, so that residuals are smaller than errors: a link adds to the degrees of freedom
+1 minus the variance of its residual in the solution over its own.
 """
 
 from __future__ import annotations
@@ -24,19 +23,18 @@ from scipy import sparse
 from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.data.statistics import outlier_factor
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.stack import Solution, Stack
+from sfa_localization.metric.stack import SegmentPoses, Stack
 
-# Of a run's factor and the doubts of its links in turn: far more than they need.
+# The factor of a run and the weights of outliers are found in turn, far more often than needed.
 _STEPS = 10
-# The variances that are stated or assumed count as so many links that miss by just as much: those
-# of a few say little.
+# The stated variances count as so many links whose residuals fit them.
 _PRIOR_LINKS = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """L turns and displacements of segments `at` (L,), as in `Segment`; those of infinite variance
-    have no weight."""
+    """L turns and displacements from segments `at` (L,) to the next, as in `Segment`; those of
+    infinite variance have no weight."""
 
     at: Indices
     run: Indices
@@ -49,16 +47,17 @@ class Links:
 
     @classmethod
     def of(cls, segments: Segments) -> Links:
-        """Of all segments from which odometry leads on."""
+        """Of all segments that odometry links to the next."""
         items = [(n, s) for n, s in enumerate(segments.items[:-1]) if s.linked]
         at = np.array([n for n, _ in items], np.int64)
         run = np.array([s.run for _, s in items], np.int64)
-        names = (one.name for one in fields(cls)[2:])
-        column: list[Any] = [np.array([getattr(s, name) for _, s in items]) for name in names]
-        return cls(at, run, *column)
+        names = (each.name for each in fields(cls)[2:])
+        columns: list[Any] = [np.array([getattr(s, name) for _, s in items]) for name in names]
+        return cls(at, run, *columns)
 
     def rows(self, stack: Stack) -> tuple[Any, Any]:
-        """Of the turns and of the displacements, (L, 3N) each: what is squared of [o, z, -b z]."""
+        """Rows (L, 3N) whose products with [o, z, -b z] are the residuals of turns, and the same of
+        displacements."""
         n, at, ones = stack.segments, self.at, np.ones(len(self.at))
         turn = -np.exp(1j * self.turn_rad)
         turns = (n + at + 1, ones), (n + at, turn), (2 * n + at, 1j * self.turn_time_s * turn)
@@ -70,62 +69,49 @@ class Links:
         std = np.sqrt(np.concatenate([self.turn_variance, self.displacement_variance]))
         return sparse.vstack(self.rows(stack)).multiply(1 / std[:, None]).tocsr()
 
-    def by_mount(self, stack: Stack, now: Solution) -> Any:
-        """Derivative (2 L, 4 + D) of the same in a solution: by how far base_link slips ahead and
-        to the left, m, where it turns by a radian, and by nothing else of the camera's mount."""
-        slip = -now.z[self.at] * (np.exp(1j * self.turn_rad) - 1)
+    def by_mount(self, stack: Stack, poses: SegmentPoses) -> Complex:
+        """Derivative (2 L, 4 + D) of these residuals by the mount (mount.py): by the slip of
+        base_link ahead and to the left, m per rad of a turn, alone."""
+        slip = -poses.z[self.at] * (np.exp(1j * self.turn_rad) - 1)
+        slip = np.where(np.isfinite(self.displacement_variance), slip, 0.0)
         columns = np.zeros((2 * len(slip), 5 + int(stack.run.max())), complex)
-        known = np.isfinite(self.displacement_variance)
-        weighted = np.where(known, slip, 0.0) / np.sqrt(self.displacement_variance)
-        columns[len(slip) :, 2], columns[len(slip) :, 3] = weighted, 1j * weighted
+        columns[len(slip) :, 2] = slip / np.sqrt(self.displacement_variance)
+        columns[:, 3] = 1j * columns[:, 2]
         return columns
 
-    def alike(self, other: Links, tolerance: float) -> bool:
-        """Whether the variances of the same links differ by less than a part, on average."""
-        for name in ('turn_variance', 'displacement_variance'):
-            known = np.isfinite(its := getattr(other, name))
-            change = np.abs(getattr(self, name)[known] / its[known] - 1.0)
-            if len(change) and change.mean() >= tolerance:
-                return False
-        return True
-
     def learned(
-        self, before: Links, stack: Stack, solution: Solution, turn_left: Array, move_left: Array
+        self, before: Links, residuals: tuple[Array, Array], uncertain: tuple[Array, Array]
     ) -> Links:
-        """Links of these variances or, in each run, of larger ones that a solution shows.
+        """These links with the variances that a solution shows, run by run; never smaller ones.
 
-        It is that of the links `before`, and leaves the variances (L,) `turn_left` and `move_left`,
-        per axis, of their turns and displacements unknown.
+        The solution of the links `before` has squared `residuals` (L,) of turns and, per axis, of
+        displacements, and its variances (L,) of these are `uncertain`.
         """
-        x = solution.coefficients(stack.period)
-        turned, moved = (np.abs(rows @ x) ** 2 for rows in self.rows(stack))
-        shown: dict[str, Any] = {}
-        for name, squares, left, axes in (
-            ('turn_variance', turned, turn_left, 1),
-            ('displacement_variance', moved / 2, move_left, 2),
-        ):
-            variances = getattr(self, name), getattr(before, name)
-            shown[name] = _grown(*variances, squares, left, self.run, axes)
-        return replace(self, **shown)
+        turned = self.turn_variance, before.turn_variance, residuals[0], uncertain[0]
+        moved = self.displacement_variance, before.displacement_variance, residuals[1], uncertain[1]
+        return replace(
+            self,
+            turn_variance=_grown(*turned, self.run, 1),
+            displacement_variance=_grown(*moved, self.run, 2),
+        )
 
 
 def _grown(
-    stated: Array, assumed: Array, squares: Array, left: Array, run: Indices, axes: int
+    stated: Array, assumed: Array, squares: Array, uncertain: Array, run: Indices, axes: int
 ) -> Array:
-    """Variances (L,): those of each run as many times the `stated` ones as its links show, and
-    more for single links that miss by far more (Student's distribution).
+    """Variances (L,) per axis: the stated ones times a factor of each run, and more for single
+    links with far larger residuals (Student's distribution). An infinite variance stays.
 
-    Links miss a solution that `assumed` other variances along each of so many `axes` by `squares`
-    (L,), and it leaves the variances `left` (L,) unknown. An infinite variance stays.
+    A solution with `assumed` variances has `squares` of residuals, and is `uncertain` of them.
     """
-    known = np.isfinite(stated)
-    of = np.where(known, stated, 1.0)
-    followed = np.minimum(left / assumed, 1.0)
-    freedom = np.bincount(run, known * (1.0 - followed)) + _PRIOR_LINKS
-    error, miss = (squares + left) / of, known * squares / of
+    finite = np.isfinite(stated)
+    unit = np.where(finite, stated, 1.0)
+    free = finite * (1.0 - np.minimum(uncertain / assumed, 1.0))
+    freedom = np.bincount(run, free) + _PRIOR_LINKS
+    error, misfit = (squares + uncertain) / unit, finite * squares / unit
     factor = np.ones(len(freedom))
     for _ in range(_STEPS):
-        doubt = outlier_factor(axes * error / factor[run], axes)
-        factor = (np.bincount(run, miss / doubt) + _PRIOR_LINKS) / freedom
+        outlier = outlier_factor(axes * error / factor[run], axes)
+        factor = (np.bincount(run, misfit / outlier) + _PRIOR_LINKS) / freedom
         factor = np.maximum(factor, 1.0)
     return np.asarray(stated * factor[run] * outlier_factor(axes * error / factor[run], axes))

@@ -1,19 +1,20 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fit a map for one basis: a regression to known places, or the places with it from eq. 1.
+"""Fit a map for one basis: a regression to the places of a pose graph, or both together by eq. 1.
 
-Then solution and noise are found in turn, because odometry's links are weighted against the images:
+For the latter, poses and noise are estimated in turn, because eq. 1 is weighted against odometry:
 
-    expand      slow features to phi(s)                          basis.py
-    eliminate   the map's weights from eq. 1                quadratic_form.py
-    solve       directions, origins and biases, certified        quadratic_form.py, phases.py
-    noise       variance and correlation of the residuals        here
-    links       variances of odometry's links                    links.py
+    expand      slow features to phi(s)                            basis.py
+    eliminate   the map's weights from eq. 1                       ridge.py
+    solve       directions, origins and biases, certified          pose_graph.py
+    noise       variance and correlation of the residuals          here
+    links       variances of odometry's links                      links.py
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -21,31 +22,28 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.metric.basis import Basis
 from sfa_localization.metric.links import Links
-from sfa_localization.metric.phases import Certificate, certify
-from sfa_localization.metric.pose_graph import Graph
-from sfa_localization.metric.quadratic_form import QuadraticForm, Ridge
+from sfa_localization.metric.pose_graph import Graph, form_of, refined
+from sfa_localization.metric.ridge import Ridge
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.settings import MetricConfig
-from sfa_localization.metric.stack import Solution, Stack
+from sfa_localization.metric.stack import SegmentPoses, Stack
 
 LINK_WEIGHT = 2.0
-"""Weight of odometry's links over that by their variances: noise of the features, which least
-squares takes for noise of the place, contracts the map, and the links counteract that."""
+"""Weight of odometry's links over that by their variances: noise of the features contracts the map,
+because least squares takes it for noise of the places, and the links counteract that."""
 # m^2 per axis: a start that the first round replaces.
 _FIRST_VARIANCE = 0.04
-# Odometry's own paths are no better than this, however well a map fits them.
+# Paths of odometry are no better than this, however well a map fits them.
 _NOISE_MIN_M = 1e-3
-# The variance settles to _SETTLED, its relative change, in two or three rounds; those of noisy
-# links, which matter less, in some more.
-_ROUNDS = 8
-_SETTLED, _LINKS_SETTLED = 0.01, 0.05
-# Residuals further apart than this many images are taken as independent.
+# Rounds, and the relative change of the variance of images that ends them.
+_ROUNDS, _SETTLED = 8, 0.01
+# Residuals so many images apart are taken as independent.
 _LAGS = 50
 
 
 @dataclass(frozen=True, slots=True)
 class MetricProblem:
-    """Everything that metric learning is given: it holds the data, `fit` solves for one basis."""
+    """Everything that metric learning is given."""
 
     features: Array
     """(M, K) slow features of the images of the segments."""
@@ -56,7 +54,7 @@ class MetricProblem:
     seed: int = 0
     """Of the parts that are left out, and of the points that the forecast draws."""
     graph: Graph | None = None
-    """Its solution, where closures or points tie the drive: they know more of it than features."""
+    """Without features, where offsets or points tie the drive better than features do."""
 
     @classmethod
     def of(
@@ -68,12 +66,11 @@ class MetricProblem:
         return cls(rows, segments, stack, Links.of(segments), config, seed)
 
     def fit(self, basis: Basis, start: MapFit | None = None, rounds: int = _ROUNDS) -> MapFit:
-        """The map of a basis: a regression to the places of the graph, where there is one, else
-        found with these from eq. 1; a near `start` saves rounds."""
+        """The map of a basis; by eq. 1 a near `start` saves rounds."""
         ridge = Ridge.of(basis, self.features)
-        if self.graph is None:
-            return _alternated(self, ridge, start, rounds)
-        return MapFit.of(self, ridge, self.graph.solution, ridge.freedom)
+        if self.graph is not None:
+            return MapFit.of(self, ridge, self.graph, self.links, 0.0, ridge.freedom)
+        return _alternated(self, ridge, start, rounds)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,27 +79,35 @@ class MapFit:
 
     problem: MetricProblem
     ridge: Ridge
-    solution: Solution
-    variance: float
-    """Of an image's residual, m^2 per axis, over its weight."""
+    graph: Graph
+    links: Links
+    """With the variances of the last round."""
+    image_variance: float
+    """m^2: eq. 1 is divided by it, that is by `variance`, by how many images count as one because
+    their residuals are correlated, and by LINK_WEIGHT."""
     residuals: Complex
-    """(M,) where odometry puts an image minus where the map does, meters."""
+    """(M,) where the segments put an image minus where the map does, meters."""
     map_weights: Complex
     """(m,)"""
-    links: Links
-    """With the variances that the solution shows, see links.py."""
-    correlation: float = 1.0
-    """How many images count as one beside odometry's links, because residuals of neighbors are
-    correlated; times LINK_WEIGHT."""
+    variance: float
+    """Of an image's residual, m^2 per axis, over its weight."""
 
     @classmethod
-    def of(cls, problem: MetricProblem, ridge: Ridge, solution: Solution, freedom: float) -> MapFit:
-        """The map of a solution, which leaves residuals with so many degrees of freedom."""
-        places = solution.places(problem.stack)
+    def of(
+        cls,
+        problem: MetricProblem,
+        ridge: Ridge,
+        graph: Graph,
+        links: Links,
+        image_variance: float,
+        freedom: float,
+    ) -> MapFit:
+        """The map of the places of a graph, whose residuals have so many degrees of freedom."""
+        places = graph.poses.places(problem.stack)
         weights = ridge.fitted(places)
         residuals = np.asarray(places - ridge.expanded @ weights)
         variance = residual_variance(residuals * np.sqrt(ridge.weights), freedom)
-        return cls(problem, ridge, solution, variance, residuals, weights, problem.links)
+        return cls(problem, ridge, graph, links, image_variance, residuals, weights, variance)
 
     @property
     def stack(self) -> Stack:
@@ -111,53 +116,42 @@ class MapFit:
     @property
     def places(self) -> Complex:
         """Where the segments put the images (M,), meters."""
-        return self.solution.places(self.stack)
+        return self.graph.poses.places(self.stack)
 
-    @property
-    def link_variance(self) -> float:
-        """Variance of a position against which odometry's links are weighted, m^2."""
-        return self.variance * self.correlation
+    def form(self, ridge: Ridge) -> Any:
+        """The form of odometry and eq. 1 with another regression, and this noise."""
+        return _form(self.stack, self.links, ridge.gram(self.stack), self.image_variance)
 
-    @property
-    def certificate(self) -> Certificate:
-        """Of the directions."""
-        graph, solution = self.problem.graph, self.solution
-        return graph.certificate if graph else certify(solution.h, solution.z)
+    def without(self, rows: Indices) -> tuple[Ridge, SegmentPoses]:
+        """The regression without some images, and the poses, which read them by eq. 1 alone."""
+        ridge = self.ridge.without(rows)
+        if self.problem.graph is not None:
+            return ridge, self.graph.poses
+        return ridge, refined(self.form(ridge), self.stack, self.graph.poses)
 
-    def form(self, ridge: Ridge) -> QuadraticForm:
-        """The quadratic form of another regression, with this noise."""
-        gram = ridge.gram(self.stack)
-        return QuadraticForm.of(gram, self.links, self.stack, self.link_variance)
 
-    def without(self, rows: Indices) -> tuple[Ridge, Solution]:
-        """The regression without some images, and the solution, which the graph's does not need
-        them for; with this noise and these biases."""
-        ridge, now = self.ridge.without(rows), self.solution
-        return ridge, now if self.problem.graph else self.form(ridge).solved(now.z, now.bias)
+def _form(stack: Stack, links: Links, gram: Complex, image_variance: float) -> Any:
+    return form_of(links.ties(stack), stack) + gram / image_variance
 
 
 def _alternated(problem: MetricProblem, ridge: Ridge, start: MapFit | None, rounds: int) -> MapFit:
-    """Alternate solution and noise until the noise settles."""
+    """Estimate poses and noise in turn until the noise settles."""
     stack, gram = problem.stack, ridge.gram(problem.stack)
-    bias: Array = start.solution.bias if start else np.zeros(stack.period[-1] + 1)
-    z = start.solution.z if start else None
+    poses = start.graph.poses if start else None
     links = start.links if start else problem.links
     variance = start.variance if start else _FIRST_VARIANCE
-    correlation = start.correlation if start else LINK_WEIGHT
+    image_variance = start.image_variance if start else LINK_WEIGHT * _FIRST_VARIANCE
     freedom = ridge.freedom - 1.5 * stack.segments
     for _ in range(rounds):
-        form = QuadraticForm.of(gram, links, stack, variance * correlation)
-        solution = form.with_biases(z, bias)
-        z, bias = solution.z, solution.bias
-        fit = MapFit.of(problem, ridge, solution, freedom)
-        correlation = LINK_WEIGHT * _correlation(fit.residuals, stack)
-        found = problem.links.learned(links, stack, solution, *form.unknown_links(solution, links))
-        steady = found.alike(links, _LINKS_SETTLED)
-        steady &= abs(fit.variance - variance) < _SETTLED * fit.variance
-        links, variance = found, fit.variance
+        graph = Graph.solved(_form(stack, links, gram, image_variance), stack, poses)
+        fit = MapFit.of(problem, ridge, graph, links, image_variance, freedom)
+        poses, links = graph.poses, graph.learned(problem.links, links)
+        steady = abs(fit.variance - variance) < _SETTLED * fit.variance
+        variance = fit.variance
+        image_variance = LINK_WEIGHT * variance * _correlation(fit.residuals, stack)
         if steady:
             break
-    return replace(fit, links=links, correlation=correlation)
+    return replace(fit, links=links, image_variance=image_variance)
 
 
 def _checked_rows(features: Array, stack: Stack, config: MetricConfig) -> Array:

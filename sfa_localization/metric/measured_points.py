@@ -1,17 +1,16 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Measured points bring a map into its owner's coordinates, at the right scale.
+"""Measured points give a map the coordinates of its owner, and the right scale.
 
 At point k, measured at p_k = x + i y with standard deviation s_k, the drive puts the robot at
 y_k = o_n + z_n q_k. Both are the same place in two frames, up to one heading, scale and place:
 
     sum_k |y_k - a p_k - t|^2 / s_k^2
 
-First `settle` finds a, t and the points that are wrong, with the covariance C of y: the largest set
-of points that a pair and the wheels' scale explain, then least squares weighted by (C + s^2)^-1.
-The odometry is scaled by 1 / |a|, and the map learned once more. Now |a| = 1, its angle turns with
-the mean of the segments, and the best t is linear in y: the sum is a quadratic form of the
-certified problem, beside that of the loop closures, and bends the map straight.
+First `settle` finds a, t and the wrong points, with the covariance C of y: the largest set that a
+pair of points and the wheels' scale explain, then least squares weighted by (C + s^2)^-1. The
+odometry is scaled by 1 / |a|, and the map learned once more. Now |a| = 1, its angle turns with the
+mean of the segments, and the best t is linear in y: the sum is one more residual of the pose graph.
 """
 
 from __future__ import annotations
@@ -38,29 +37,27 @@ from sfa_localization.data.messages import LARGEST_SCALE
 from sfa_localization.data.run import Odometry, Points, Stamps
 
 if TYPE_CHECKING:
-    from sfa_localization.metric.stack import Solution, Stack
+    from sfa_localization.metric.stack import SegmentPoses, Stack
 
 
 WHEELS_STD = 0.02
-"""Of the scale of wheels before anything is measured: half-real drives count up to 2 % wrong."""
+"""Prior of the scale of wheels: in drives of real robots they count up to 2 % wrong."""
 CONTRADICTION = 0.05
 """A scale that differs more from that of the wheels is worth a warning."""
 TURN_STD_MAX = 0.1
-"""rad: points that know the map's heading less well are at one place."""
+"""rad: points that give the map's heading less well are at one place."""
 NEAR_M = 1.5
 """A point is placed by the odometry from the nearest image, at most this far."""
-# Squared distance of a point from where it should be, over its variance, that 1 of 10,000 exceeds.
-_WRONG = -2.0 * math.log(1e-4)
-# Where more than one point, or a quarter, seem wrong, the drive errs by more than it claims: in
-# variance at most so much.
-_MOST_GROWN = 4.0**6
+# Gate: the squared error of a point over its variance, which 1 of 10,000 exceeds.
+_GATE = -2.0 * math.log(1e-4)
+# Where more than one point, or a quarter, are outliers, the covariance of the drive grows by up to:
+_GROWTH_MAX = 4.0**6
 
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """What K points say: which are `used`, whether they lie apart, so that the map's heading is
-    theirs (`turned`), and by how much the wheels' meters are to be multiplied.
-    """
+    """Which of K points are `used`, whether these give the map's heading (`turned`), and the scale:
+    multiply the wheels' meters by it."""
 
     used: Mask
     turned: bool = False
@@ -70,9 +67,8 @@ class Settled:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPoints:
-    """K points beside images: the robot was `offset` (K,) x + i y m, in its own axes, from where
-    it took an image when it stood at a measured place.
-    """
+    """K points, and images near them: the robot stood at a point `offset` (K,) x + i y m, in its
+    own axes, from where it took the image; `images` are -1 where none is near."""
 
     points: Points
     images: Indices
@@ -88,48 +84,47 @@ class MeasuredPoints:
         settled: Settled | None = None,
         lever: complex = 0j,
     ) -> MeasuredPoints:
-        """Points beside the nearest of the used `images`, which are numbered drive after drive.
+        """Points with the nearest of the used `images`, which are numbered drive after drive.
 
-        A drive is its odometry and the stamps of its images; a point is of the first that was under
-        way then. Points that are near no image stay out. They are places of base_link, images those
-        of a camera at a `lever`, ahead + i left, m, of it.
+        A drive is its odometry and the stamps of its images. A point is of the first drive that
+        covers its stamp. Points are places of base_link, images those of a camera at a `lever` arm,
+        ahead + i left, m.
         """
-        at, offset = np.full(len(points), -1, np.int64), np.full(len(points), np.inf, complex)
-        start, left = 0, np.ones(len(points), bool)
+        nearest, offset = np.full(len(points), -1), np.full(len(points), np.inf, complex)
+        start, pending = 0, np.ones(len(points), bool)
         for odometry, stamps in drives:
-            own = images[(images >= start) & (images < start + len(stamps))]
-            inside = left & odometry.trajectory.covers(points.stamps_ns)
-            left &= ~inside
-            for k in np.flatnonzero(inside) if len(own) else ():
-                after = int(np.searchsorted(stamps[own - start], points.stamps_ns[k]))
-                for image in own[max(after - 1, 0) : after + 1].tolist():
-                    pair = np.array([stamps[image - start], points.stamps_ns[k]])
-                    moved = relative(*odometry.trajectory.at(pair))
-                    if abs(moved[0] + 1j * moved[1]) < abs(offset[k]):
-                        at[k], offset[k] = image, moved[0] + 1j * moved[1]
+            used = images[(images >= start) & (images < start + len(stamps))] - start
+            covered = pending & odometry.trajectory.covers(points.stamps_ns)
+            pending &= ~covered
+            after = np.searchsorted(stamps[used], points.stamps_ns)
+            for row in (after - 1, after) if len(used) and covered.any() else ():
+                image = used[row.clip(0, len(used) - 1)]
+                poses = (odometry.trajectory.at(at) for at in (stamps[image], points.stamps_ns))
+                moved = relative(*poses)[:, :2] @ [1, 1j]
+                nearer = covered & (np.abs(moved) < np.abs(offset))
+                nearest[nearer], offset[nearer] = image[nearer] + start, moved[nearer]
             start += len(stamps)
         near = np.abs(offset) <= NEAR_M
         settled = settled or Settled(np.zeros(len(points), bool))
-        return cls(points, np.where(near, at, -1), np.where(near, offset - lever, 0.0), settled)
+        return cls(points, np.where(near, nearest, -1), np.where(near, offset - lever, 0), settled)
 
     @property
     def placed(self) -> Mask:
-        """(K,) of the points that are near an image."""
+        """(K,) of the points near an image."""
         return self.images >= 0
 
     def rows(self, stack: Stack) -> Complex:
-        """Rows (K, 3N) whose products with [o, z, -b z] are where the drive puts the robot; 0 of
-        points that are near no image.
-        """
+        """Rows (K, 3N) whose products with [o, z, -b z] are where the drive puts the robot; 0 for
+        points near no image."""
         rows, placed = stack.rows(self.images), self.placed.astype(float)
         beside = stack.facing_rows(rows, placed * self.offset)
         return np.asarray((stack.place_rows(rows, placed) + beside).toarray())
 
-    def ties(self, stack: Stack, before: Solution | None = None) -> sparse.csr_array:
-        """What is squared (K, 3N) of the used points in [o, z, -b z], over its standard deviation.
+    def ties(self, stack: Stack, before: SegmentPoses | None = None) -> sparse.csr_array:
+        """Rows (K, 3N) of the residuals of the used points over their standard deviations.
 
-        The heading of the points turns with the mean of the segments from what it is in the
-        solution `before`, without which nothing is tied.
+        The heading of the points turns with the mean of the segments from that at the poses
+        `before`, without which there are no rows.
         """
         n, used = stack.segments, self.settled.used & self.settled.turned
         if before is None or not used.any():
@@ -142,9 +137,8 @@ class MeasuredPoints:
         return sparse.csr_array(rows)
 
     def frame(self, places: Complex, start: RigidTransform) -> RigidTransform:
-        """The transform that lays places (K,) on the points used; `start` where there are none, and
-        its heading where these are at one place.
-        """
+        """The transform from places (K,) to the used points; `start` without any, and with its
+        heading where they are at one place."""
         used = self.settled.used
         if not used.any():
             return start
@@ -156,41 +150,38 @@ class MeasuredPoints:
         return RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
 
     def quality(self, places: Complex) -> dict[str, Any]:
-        """Figures that are stored in the model: by how much a map misses each point that puts the
-        robot at places (K,).
-        """
-        missed, settled = np.abs(places - self.points.places), self.settled
+        """Figures that are stored in the model, of a map that puts the robot at places (K,)."""
+        missed = np.abs(places - self.points.places).tolist()
+        columns = self.points.rows(), missed, self.settled.used.tolist()
         return {
             'points': [
-                {'name': name, 'x_m': at.real, 'y_m': at.imag, 'miss_m': miss, 'used': used}
-                for (name, _, at, _), miss, used in zip(
-                    self.points.rows(), missed.tolist(), settled.used.tolist(), strict=True
-                )
+                {'name': name, 'x_m': place.real, 'y_m': place.imag, 'miss_m': miss, 'used': used}
+                for (name, _, place, _), miss, used in zip(*columns, strict=True)
             ],
         }
 
     def warnings(self, places: Complex) -> Iterator[str]:
-        """What is wrong with the points, in words, for a map that puts the robot at places (K,)."""
-        missed, settled = np.abs(places - self.points.places), self.settled
-        columns = self.points.names, self.placed.tolist(), settled.used.tolist(), missed.tolist()
-        for name, placed, used, miss in zip(*columns, strict=True):
+        """What is wrong with the points, for a map that puts the robot at places (K,)."""
+        settled, count = self.settled, int(self.settled.used.sum())
+        for point, placed in zip(self.quality(places)['points'], self.placed, strict=True):
+            name, miss = point['name'], point['miss_m']
             if not placed:
                 yield f'{name}: no image within {NEAR_M} m was used: left out'
-            elif not used:
+            elif not point['used']:
                 yield f'{name}: {miss:.2f} m from where the others put it: left out, measure again'
-        if settled.used.sum() == 2 < self.placed.sum():
+        if count == 2 < self.placed.sum():
             yield 'no third point agrees with the two that are used: measure more points'
-        if settled.used.sum() == 2 == self.placed.sum() and settled.turned:
+        if count == 2 == self.placed.sum() and settled.turned:
             yield 'two points fit a mirrored drive too: a third shows whether x and y are swapped'
-        if settled.used.sum() > 1 and not settled.turned:
+        if count > 1 and not settled.turned:
             yield (
                 'the points are at one place: heading and scale are those of the odometry; measure '
-                'another one, some meters away'
+                'another point some meters away'
             )
         if abs(settled.scale - 1.0) > CONTRADICTION:
             yield (
-                f'by the points the wheels count {1 / settled.scale - 1.0:+.1%} of way: check both '
-                'and that the points are those of base_link, not of an antenna'
+                f'by the points, the wheels count {1 / settled.scale - 1.0:+.1%} of way: check '
+                'both, and that the points are those of base_link, not of an antenna'
             )
 
 
@@ -207,86 +198,83 @@ def settle(measured: MeasuredPoints, places: Complex, covariance: Complex) -> Se
         )
     points, std = measured.points.places[placed], measured.points.std[placed]
     points = points - points.mean()  # some coordinates count from the equator
-    known = covariance[np.ix_(placed, placed)]
-    fit = _Fit(points, places[placed], known + np.diag(std**2))
-    if not fit.apart().any():
+    by_drive = covariance[np.ix_(placed, placed)]
+    fit = _Similarity(points, places[placed], by_drive + np.diag(std**2))
+    if not fit.pairs().any():
         return Settled(placed)
-    cost, kept = fit.consensus()
-    if len(points) > 2 and replace(fit, points=points.conj()).consensus()[0] < cost - _WRONG:
+    cost, inliers = fit.consensus()
+    if len(points) > 2 and replace(fit, points=points.conj()).consensus()[0] < cost - _GATE:
         raise DataError('the points fit the drive mirrored: exchange x and y, or turn one around')
     if not np.isfinite(cost):
         raise DataError(
             f'the measured points contradict the wheels by more than a factor of {LARGEST_SCALE}: '
             'are they in meters, and each at its time?'
         )
-    found, grown = fit.settled(kept), 1.0
-    while (~found.used).sum() > max(1, len(points) // 4) and grown < _MOST_GROWN:
-        grown *= 4.0
-        fit = replace(fit, noise=grown * known + np.diag(std**2))
-        found = fit.settled(fit.consensus()[1])
-    if not found.turned:
+    settled, growth = fit.settled(inliers), 1.0
+    while (~settled.used).sum() > max(1, len(points) // 4) and growth < _GROWTH_MAX:
+        growth *= 4.0
+        fit = replace(fit, noise=growth * by_drive + np.diag(std**2))
+        settled = fit.settled(fit.consensus()[1])
+    if not settled.turned:
         raise DataError(
-            'the measured points lie apart, but not as the drive does: is each stop numbered as '
-            'inspect numbers it, and each point that of base_link, x_m before y_m?'
+            'the measured points have not the shape of the drive: is each stop numbered as inspect '
+            'numbers it, and each point that of base_link, x_m before y_m?'
         )
     used = placed.copy()
-    used[placed] = found.used
-    return replace(found, used=used)
+    used[placed] = settled.used
+    return replace(settled, used=used)
 
 
 @dataclass(frozen=True, slots=True)
-class _Fit:
-    """Points (K,) and the places (K,) of a drive that should be those, in its own frame; the errors
-    of both together have a covariance (K, K) per axis.
-    """
+class _Similarity:
+    """Points (K,) and the places (K,) of a drive that should be a p + t; the errors of both
+    together have the covariance `noise` (K, K) per axis."""
 
     points: Complex
     places: Complex
     noise: Complex
 
     @property
-    def _own(self) -> Array:
+    def _variance(self) -> Array:
         """(K,) m^2, of each point."""
         return np.asarray(np.diag(self.noise).real)
 
-    def apart(self) -> Mask:
-        """(K, K): the pairs that show a direction."""
+    def pairs(self) -> Mask:
+        """(K, K): the pairs far enough from each other to give a heading."""
         far = np.maximum(*(np.abs(np.subtract.outer(p, p)) for p in (self.points, self.places)))
-        return np.asarray(np.sqrt(np.add.outer(self._own, self._own)) < TURN_STD_MAX * far)
+        std = np.sqrt(np.add.outer(self._variance, self._variance))
+        return np.asarray(std < TURN_STD_MAX * far)
 
     def consensus(self) -> tuple[float, Mask]:
-        """The cost of the likeliest points (K,) that one pair and the wheels explain, and these."""
-        best, own = (np.inf, np.ones(len(self.points), bool)), self._own
-        for i, j in np.argwhere(np.triu(self.apart())).tolist():
+        """The least cost of a pair of points, and its inliers (K,): outliers cost the gate."""
+        least, inliers = np.inf, np.ones(len(self.points), bool)
+        for i, j in np.argwhere(np.triu(self.pairs())).tolist():
             a = (self.places[j] - self.places[i]) / (self.points[j] - self.points[i] or 1e-9)
             if not 1 / LARGEST_SCALE < abs(a) < LARGEST_SCALE:
                 continue
-            missed = self.places - self.places[i] - a * (self.points - self.points[i])
-            squares = np.abs(missed) ** 2 / own
+            residuals = self.places - self.places[i] - a * (self.points - self.points[i])
+            squares = np.abs(residuals) ** 2 / self._variance
             wheels = (np.log(abs(a)) / WHEELS_STD) ** 2
-            cost = float(np.minimum([*squares, wheels], _WRONG).sum())
-            if cost < best[0]:
-                best = cost, squares < _WRONG
-        return best
+            cost = float(np.minimum([*squares, wheels], _GATE).sum())
+            if cost < least:
+                least, inliers = cost, squares < _GATE
+        return least, inliers
 
     def settled(self, used: Mask) -> Settled:
-        """Least squares of the points used (K,), until these are all that fit."""
+        """Least squares of the points used (K,), until these are the inliers."""
+        frame = np.column_stack([self.points, np.ones(len(used))])
         for _ in range(len(used)):
-            (a, t), spread = self._solved(used)
-            frame = np.column_stack([self.points, np.ones(len(used))])
-            own = self._own + np.einsum('ki,ij,kj->k', frame, spread, frame.conj()).real
-            kept = np.abs(self.places - a * self.points - t) ** 2 < _WRONG * own
-            if (kept == used).all() or kept.sum() < 2:
+            noise = self.noise[np.ix_(used, used)]
+            weighted = linalg.solve(noise, frame[used], assume_a='pos').conj().T
+            covariance = np.linalg.pinv(weighted @ frame[used], hermitian=True)  # of a and t
+            a, t = covariance @ (weighted @ self.places[used])
+            by_frame = np.einsum('ki,ij,kj->k', frame, covariance, frame.conj()).real
+            squares = np.abs(self.places - a * self.points - t) ** 2
+            inliers = squares < _GATE * (self._variance + by_frame)
+            if (inliers == used).all() or inliers.sum() < 2:
                 break
-            used = kept
-        variance = float(spread[0, 0].real) / abs(a) ** 2  # of log |a|, and of the angle, rad^2
+            used = inliers
+        variance = float(covariance[0, 0].real) / abs(a) ** 2  # of log |a|, and of the angle, rad^2
         share = WHEELS_STD**2 / (WHEELS_STD**2 + variance)
         turned = variance < TURN_STD_MAX**2
         return Settled(used, turned, float(abs(a) ** -share), float(np.sqrt(variance * share)))
-
-    def _solved(self, used: Mask) -> tuple[Complex, Complex]:
-        """a and t, and their covariance (2, 2) per axis."""
-        frame = np.column_stack([self.points, np.ones(len(used))])[used]
-        weighted = linalg.solve(self.noise[np.ix_(used, used)], frame, assume_a='pos').conj().T
-        spread = np.linalg.pinv(weighted @ frame, hermitian=True)
-        return spread @ (weighted @ self.places[used]), spread

@@ -2,62 +2,61 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the camera sits on the robot, learned with the map.
 
-Odometry moves base_link, images show places of a camera that sits at a lever l, ahead + i left, of
-it. Image m of segment n lies at
+Odometry moves base_link, images show places of a camera at a lever arm l, ahead + i left, of it.
+Image m of segment n lies at
 
     x_nm = o_n + z_n (q_nm + l exp(i h_nm)),
 
-and in drive d it looks kappa_d to the left of where it did in the first drive, so that closures
-turn by kappa_d more. Wheels may slip in turns: a turn by t moves base_link by s (exp(i t) - 1)
-beside, which links take for a lever. With v = [l, s, kappa], for the best [o, z, b] at some v what
-is squared of links and closures is r, with derivatives A by [o, z, b] and B by v. To first order
+and in drive d the camera is turned to the left by kappa_d since the first drive, and so are the
+offsets. Wheels may slip in turns: a turn by t moves base_link by s (exp(i t) - 1), which looks like
+a lever arm. Let r be the residuals of odometry and offsets, A and B their derivatives by the poses
+and by v = [l, s, kappa], and N = A^T A. To first order, at the best poses,
 
-    S = B^T B - B^T A N^-1 A^T B,    h = S v - B^T r,
+    S = B^T B - B^T A N^-1 A^T B,    h = S v - B^T r.
 
-with N the normal equations of [o, z, b]. Beside them stands what is known of robots: the camera
-sits above base_link, or where it was measured, to 5 mm, and wheels may slip; or, as probable, they
-do not, and it sits anywhere on the robot. With the prior's covariance C, either has the posterior
-covariance (S + C^-1)^-1 = D, the mean D h and the evidence (|D| / |C|)^(1/2) exp(h^T D h / 2),
-times the likelihood of how images change in turns on the spot (keyframes/turning.py); by these both
-are mixed. A drive that never turns where it is seen again does not show l: it stays uncertain.
+There are two priors of equal probability: the camera sits above base_link, or where it was
+measured, to 5 mm, and wheels may slip; or it sits anywhere on the robot and wheels do not slip.
+With a prior's covariance C, the posterior has the covariance (S + C^-1)^-1 = D, the mean D h and
+the evidence (|D| / |C|)^(1/2) exp(h^T D h / 2), times the likelihood of how images change in turns
+on the spot (keyframes/turning.py). The evidence mixes both. Where a drive never turns, l stays
+uncertain.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special
 
-from sfa_localization.data.geometry import Array, Complex
+from sfa_localization.data.geometry import Array
 from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity
 from sfa_localization.keyframes.turning import UNSURE
 
 GIVEN_STD_M = 0.005
-"""Of a camera's place that was measured on the robot."""
+"""Of a lever arm that was measured on the robot."""
 SLIP_STD_M = 0.1
-"""How far base_link may be from the point about which wheels turn the robot: a third of the track
-of a small one that slips on one side."""
+"""From base_link to the point about which the wheels turn the robot: a third of the track of a
+small robot that slips on one side."""
 LEVEL_M2 = 0.03**2
-"""Images of a camera above base_link may change in turns as if it were 3 cm beside it: robots sway
-(two gardens: 0 and 4 cm)."""
+"""Robots sway: in turns, images of a camera above base_link change as if it were 3 cm beside it (0
+and 4 cm in two gardens)."""
 CAMERA_TURN_STD = 1.0
-"""rad, of the yaw of a camera in a later drive: it may have been taken off and put back anyhow."""
+"""rad, of the yaw of a camera in a later drive, which may be mounted anew."""
 
 CONTRADICTS = 4.0
-"""Standard deviations by which two measurements of a place never differ by chance, in the plane."""
+"""Standard deviations: two measurements of a place never differ by so many by chance."""
 MOUNTED_ANEW_RAD = 0.05
-"""A camera turned by more between two drives was taken off: how it looks now, nobody knows. What a
-drive of 100 m shows of it errs by 0.01."""
+"""A camera that was turned by more between two drives was mounted anew, and its yaw on the robot
+now is not known. A drive of 100 m shows it to 0.01."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """The camera at a `lever`, ahead + i left of base_link, m, turned by `yaw` (D,) rad in each of
-    D drives, with their `covariance` (2 + D, 2 + D); `given` is a lever that was measured, and
-    `learned` what the closures say of it."""
+    """The camera at a `lever` arm, ahead + i left of base_link, m, turned by `yaw` (D,) rad in each
+    of D drives, with their `covariance` (2 + D, 2 + D); `given` is a lever arm that was
+    measured."""
 
     lever: complex = 0j
     yaw: tuple[float, ...] = (0.0,)
@@ -66,7 +65,7 @@ class Mount:
     turning: Quantity | None = None
     """|l|^2, m^2, by how images change in turns on the spot."""
     learned: tuple[complex, float] | None = None
-    """The lever by closures alone, and the standard deviation of its coordinates, m."""
+    """The lever arm by images alone, and the standard deviation of its coordinates, m."""
 
     @classmethod
     def at(cls, place: complex | None) -> Mount:
@@ -74,24 +73,23 @@ class Mount:
         return cls(place or 0j, given=place)
 
     @property
-    def known(self) -> Array:
-        """The covariance, or that of the prior."""
+    def uncertainty(self) -> Array:
+        """The covariance (2 + D, 2 + D), or that of the prior."""
         if self.covariance is not None:
             return self.covariance
         lever_std = CAMERA_STD_M if self.given is None else GIVEN_STD_M
         return np.diag([lever_std**2] * 2 + [CAMERA_TURN_STD**2] * len(self.yaw))
 
     def _priors(self) -> tuple[Array, Array]:
-        """Variances (3 + D,) of [l, s, kappa], of all but the first drive's yaw, which is 0 by
-        definition: of a camera above base_link, or measured, and of one anywhere.
-        """
+        """Variances (3 + D,) of [l, s, kappa] without the first drive's yaw, which is 0: of a
+        camera above base_link, or at the measured place, and of a camera anywhere on the robot."""
         later = [CAMERA_TURN_STD**2] * (len(self.yaw) - 1)
         placed, anywhere, slip = GIVEN_STD_M**2, CAMERA_STD_M**2, SLIP_STD_M**2
         above = [placed, placed, slip, slip, *later]
         return np.array(above), np.array([anywhere, anywhere, placed, placed, *later])
 
     def of(self, drives: int) -> Mount:
-        """The same of so many drives; nothing is known of the yaw in later ones."""
+        """The same for so many drives, with yaw 0 in those not seen yet."""
         return replace(self, yaw=(*self.yaw, *[0.0] * (drives - len(self.yaw))))
 
     def base(self, poses: Array, drive: int) -> Array:
@@ -100,42 +98,35 @@ class Mount:
         place = poses[:, 0] + 1j * poses[:, 1] - self.lever * np.exp(1j * yaw)
         return np.column_stack([place.real, place.imag, yaw])
 
-    def stepped(self, missed: Complex, by_mount: Complex, by_rest: Array, solve: Solve) -> Mount:
-        """After a step from what links and closures miss (L,) by, its derivative (L, 4 + D), and
-        the products (P, 4 + D) of that with the derivative by the rest, whose covariance (P, P)
-        times columns `solve` gives.
-        """
-        mount, center = self.of(by_mount.shape[1] - 4), self.given or 0j
+    def stepped(self, information: Array, gradient: Array) -> Mount:
+        """One step on, by S (4 + D, 4 + D) and B^T r (4 + D,) at the mount of the segments."""
+        mount, center = self.of(len(gradient) - 4), self.given or 0j
         moved = self.lever - center
+        # Of all but the yaw in the first drive, which is 0.
+        free = np.delete(np.arange(len(gradient)), 4)
         value = np.array([moved.real, moved.imag, 0.0, 0.0, *mount.yaw[1:]])
-        free = np.flatnonzero(np.arange(len(value) + 1) != 4)
-        columns, rest = by_mount[:, free], by_rest[:, free]
-        shown = np.real(columns.conj().T @ columns) - rest.T @ solve(rest)
-        pull = shown @ value - np.real(columns.conj().T @ missed)
+        information = information[np.ix_(free, free)]
+        pull = information @ value - gradient[free]
         means, spreads, evidence = [], [], []
         for prior in mount._priors():
-            spread = np.linalg.inv(shown + np.diag(1 / prior))
+            spread = np.linalg.inv(information + np.diag(1 / prior))
+            mean = spread @ pull
             size = np.linalg.slogdet(spread)[1] - np.log(prior).sum()
-            means.append(spread @ pull)
+            lever = center + complex(*mean[:2])
+            evidence.append((size + pull @ mean) / 2 + self._by_turns(lever))
+            means.append(mean)
             spreads.append(spread)
-            lever = center + complex(*means[-1][:2])
-            evidence.append((size + pull @ means[-1]) / 2 + self._by_turns(lever))
         share = np.array([1.0, 0.0]) if self.given is not None else special.softmax(evidence)
         mean = share @ np.array(means)
-        spread = sum(
-            part * (each + np.outer(one - mean, one - mean))
-            for part, each, one in zip(share, spreads, means, strict=True)
-        )
-        # Of the lever and all yaws, the first of which is 0.
-        kept = np.r_[0, 1, 4 : len(mean)]
-        rows = np.r_[0, 1, 3 : len(kept) + 1]
-        covariance = np.zeros((2 + len(mount.yaw), 2 + len(mount.yaw)))
-        covariance[np.ix_(rows, rows)] = spread[np.ix_(kept, kept)]
+        deviations = np.array(means) - mean
+        spread = np.einsum('p,pij->ij', share, spreads)
+        spread += np.einsum('p,pi,pj->ij', share, deviations, deviations)
+        covariance = np.insert(np.insert(spread, 4, 0.0, axis=0), 4, 0.0, axis=1)
         return replace(
             self,
-            lever=center + complex(mean[0], mean[1]),
+            lever=center + complex(*mean[:2]),
             yaw=(0.0, *mean[4:].tolist()),
-            covariance=covariance,
+            covariance=np.delete(np.delete(covariance, (2, 3), axis=0), (2, 3), axis=1),
             learned=(lever, float(np.sqrt(spreads[1].diagonal()[:2].mean()))),
         )
 
@@ -143,41 +134,38 @@ class Mount:
         """Logarithm of the likelihood of the changes of images in turns, for a lever."""
         if self.turning is None:
             return 0.0
-        square, (seen, std) = abs(lever) ** 2, self.turning
+        square, (measured, std) = abs(lever) ** 2, self.turning
         variance = std**2 + LEVEL_M2**2 + (UNSURE * square) ** 2
-        return -(((square - seen) ** 2) / variance + math.log(variance)) / 2
+        return -(((square - measured) ** 2) / variance + math.log(variance)) / 2
 
     @property
     def contradiction(self) -> str:
-        """How the closures contradict a measured place, in words; '' where they do not."""
+        """The sentence that says how images contradict a measured lever arm, or ''."""
         if self.given is None or self.learned is None:
             return ''
         (lever, std), given = self.learned, self.given
         if abs(lever - given) < CONTRADICTS * math.hypot(std, GIVEN_STD_M):
             return ''
         return (
-            f'the camera is said to sit {given.real:.2f} m ahead and {given.imag:.2f} m left of '
-            f'base_link, the images show {lever.real:.2f} and {lever.imag:.2f} m (+- {std:.2f}): '
+            f'the camera is stated to be {given.real:.2f} m ahead and {given.imag:.2f} m left of '
+            f'base_link, but images show {lever.real:.2f} and {lever.imag:.2f} m (+- {std:.2f}): '
             'check camera_xy, or /tf_static'
         )
 
     def differs(self, other: Mount, least_m: float) -> bool:
-        """Whether another one is so far off, or turned by as much of a meter away."""
+        """Whether another mount moves what is a meter away by more than this."""
         turned = np.abs(np.subtract(self.yaw, other.yaw)).max()
         return max(abs(self.lever - other.lever), float(turned)) > least_m
 
     @property
     def quantities(self) -> dict[str, Quantity]:
-        """Of `Rig`: where the camera sits, and how it looks on average of the drives."""
-        ahead, left = np.sqrt(np.diag(self.known)[:2]).tolist()
+        """Of `Rig`: the lever arm, and the mean yaw of the drives."""
+        ahead_std, left_std = np.sqrt(np.diag(self.uncertainty)[:2]).tolist()
         spread = float(np.std(self.yaw, ddof=1)) if len(self.yaw) > 1 else 0.0
-        # A filter takes an angle that stays for noise that does not.
+        # A filter would take a constant angle for noise.
         spread = spread if max(map(abs, self.yaw)) < MOUNTED_ANEW_RAD else UNKNOWN_YAW_STD
         return {
-            'camera_ahead': Quantity(self.lever.real, ahead),
-            'camera_left': Quantity(self.lever.imag, left),
+            'camera_ahead': Quantity(self.lever.real, ahead_std),
+            'camera_left': Quantity(self.lever.imag, left_std),
             'camera_yaw': Quantity(float(np.mean(self.yaw)), spread),
         }
-
-
-Solve = Callable[[Array], Array]

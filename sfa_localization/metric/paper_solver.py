@@ -16,8 +16,9 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.metric.basis import PAPER_FEATURES, Monomials, monomials
 from sfa_localization.metric.map_fit import MapFit, MetricProblem, residual_variance
-from sfa_localization.metric.quadratic_form import Ridge
-from sfa_localization.metric.stack import Solution
+from sfa_localization.metric.pose_graph import Graph, form_of, refined
+from sfa_localization.metric.ridge import Ridge
+from sfa_localization.metric.stack import SegmentPoses
 
 ITERATIONS = 1000
 """Section 4: the descent ends at about 1000 iterations."""
@@ -137,13 +138,15 @@ def learn(problem: MetricProblem) -> MapFit:
 
 
 def _fit(lines: Lines, theta: Complex, count: int, problem: MetricProblem) -> MapFit:
-    """The result of the descent as a fit."""
+    """The result of the descent as a fit, with the certificate of the minimum that is near."""
     stack, terms = problem.stack, lines.regressors.shape[1]
     basis = Monomials(np.zeros(terms - 1), np.eye(terms - 1), np.zeros(terms), count)
-    ridge, bias = Ridge.of(basis, problem.features), np.zeros(stack.period[-1] + 1)
+    ridge = Ridge.of(basis, problem.features)
     alpha, origins, weights = lines.parts(theta)
-    weights, solution = np.roll(weights, -1), Solution(np.exp(1j * alpha), origins, bias)
-    residuals = solution.places(stack) - ridge.expanded @ weights
+    weights = np.roll(weights, -1)
+    poses = SegmentPoses(np.exp(1j * alpha), origins, np.zeros(stack.period[-1] + 1))
+    residuals = poses.places(stack) - ridge.expanded @ weights
     variance = residual_variance(residuals, ridge.freedom - 1.5 * stack.segments)
-    fit = MapFit(problem, ridge, solution, variance, residuals, weights, problem.links)
-    return replace(fit, solution=replace(solution, h=fit.form(ridge).at(bias)))
+    form = form_of(problem.links.ties(stack), stack) + ridge.gram(stack) / variance
+    graph = replace(Graph.at(form, stack, refined(form, stack, poses)), poses=poses)
+    return MapFit(problem, ridge, graph, problem.links, variance, residuals, weights, variance)

@@ -21,7 +21,7 @@ from sfa_localization.metric.segments import IMAGE_STEP_MIN_M, IMAGE_TURN_MIN_RA
 STOP_S = 2.0
 """A robot that stands for so long has stopped."""
 MOST = 100
-"""Points that are used of a topic: the errors of a receiver are alike for a while."""
+"""Points that are used of a topic: neighboring errors of a receiver are correlated."""
 LARGEST_FILE = 1 << 20
 _USAGE = 'lines are "stamp_s, x_m, y_m" or "stop, number, x_m, y_m", then perhaps std_m, above 0'
 
@@ -40,9 +40,9 @@ def stops(odometry: Odometry) -> Stamps:
 
 
 def points_of(runs: Sequence[Run], path: str) -> Points | None:
-    """The points of a file, whose stops are those of the first run, and of the runs' topics.
+    """The points of a file, whose stops are those of the first run, and of the topics of the runs.
 
-    Raises DataError for a file that cannot be used, or that names a time when no drive was.
+    Raises DataError for an unusable file, and for a stamp outside of the drives.
     """
     rows = read_points(Path(path), runs[0].odometry).rows() if path else []
     drives = [(run.odometry.stamps_ns[0], run.odometry.stamps_ns[-1]) for run in runs]
@@ -59,7 +59,7 @@ def points_of(runs: Sequence[Run], path: str) -> Points | None:
 
 
 def read_points(path: Path, odometry: Odometry) -> Points:
-    """Read a file of points. Raises DataError, with the line, for what is none."""
+    """Read a file of points. Raises DataError that names the line."""
     try:
         lines = read_regular(path, LARGEST_FILE).decode('utf-8-sig').splitlines()
     except (OSError, UnicodeDecodeError) as error:

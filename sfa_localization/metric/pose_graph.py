@@ -1,277 +1,325 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What odometry, loop closures and measured points alone say of all drives, with a certificate.
+"""The poses of all segments by least squares, with a certificate of global optimality.
 
-The least squares of links.py, loops.py and measured_points.py in [o, z, -b z] (see stack.py),
-without features: each square reads few segments, so that Gauss and Newton's normal equations are
-sparse, and a drive of thousands of segments takes seconds. With multipliers
-Lambda = diag(Re(conj(z) * (S x)_z)), S the quadratic form at the biases and x = [o, z] where o is
-best, S - diag(0, Lambda) >= 0 proves the directions optimal, as H - Lambda >= 0 does in phases.py:
-H is what S leaves of z. A sparse factor shows it by the signs of its pivots.
+Every residual is linear in y = [o, z, -b z] (see stack.py): those of odometry (links.py), of
+offsets between images (loops.py), of measured points (measured_points.py), and those of eq. 1 of
+the paper (ridge.py). So their sum of squares is a form y^H G y, with |z_n| = 1. G is sparse without
+eq. 1, and thousands of segments take seconds.
+
+Newton's steps minimize it from the path of the odometry. Let S be the form in x = [o, z] at the
+biases found, o be best, and Lambda = diag(Re(conj(z) * (S x)_z)). If S - diag(0, Lambda) >= 0, no
+other directions are better. The signs of the pivots of a sparse factor tell.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
-from sfa_localization.data.geometry import Array, Complex
+from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.data.statistics import evenly
 from sfa_localization.metric.links import Links
-from sfa_localization.metric.loops import Loops, loops_of
-from sfa_localization.metric.measured_points import MeasuredPoints
+from sfa_localization.metric.loops import Loops
 from sfa_localization.metric.mount import Mount
-from sfa_localization.metric.phases import CERTIFICATE_TOLERANCE, Certificate, unit
-from sfa_localization.metric.quadratic_form import YAW_BIAS_STD
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.stack import Solution, Stack
+from sfa_localization.metric.stack import SegmentPoses, Stack
 
-# Of the solution and the weights that it shows, in turn: as settled as its use needs.
+CERTIFICATE_TOLERANCE = 1e-9
+"""Relative to the largest entry of the form: rounding of an exact zero."""
+YAW_BIAS_STD = 0.003
+"""rad/s: prior of the yaw-rate bias of odometry or a gyroscope, estimated per period."""
+SAMPLED = 500
+"""Links, or images, of which uncertainties are computed: those between are alike."""
+# Poses and the weights of residuals are estimated in turn: so often that neither changes much.
 _ROUNDS = 3
-# Weight of the distance from the middle beside closures, 1 / m^2: drives that nothing ties stay.
-_STAY = 1e-6
-# The same of directions, 1 / rad^2.
-_UNTIED = 1e-3
-# Far more than Gauss and Newton need from odometry's own path.
-_STEPS, _HALVED, _CONVERGED = 50, 20, 1e-9
-# Columns that are solved for at a time: memory.
-_AT_ONCE = 256
-SHOWN = 500
-"""Links, or images, of which is found how well the others tell them: neighbors are told alike."""
+# Weak priors of origins (1 / m^2) and directions (1 / rad^2), for drives that nothing ties.
+_ORIGIN_PRIOR, _DIRECTION_PRIOR = 1e-8, 1e-3
+# Newton's steps, halvings of a step, and the decrease of the cost that ends them.
+_STEPS, _HALVINGS, _CONVERGED = 100, 20, 1e-8
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """Proof that no other directions are better: the least pivot of S - diag(0, Lambda), over the
+    largest entry of S."""
+
+    eigenvalue: float
+
+    @property
+    def certified(self) -> bool:
+        return self.eigenvalue >= -CERTIFICATE_TOLERANCE
 
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """The `solution` of N segments with R biases, whether it is proven, and what that leaves
-    unknown: `factor` is that of the normal equations of [Re o, Im o, angles of z, b]."""
+    """The poses of N segments with R biases, whether they are proven, and the `factor` of the
+    inverse of their covariance: that of [Re o, Im o, angles of z, b], P = 3 N + R."""
 
     stack: Stack
-    solution: Solution
+    poses: SegmentPoses
     certificate: Certificate
     factor: SuperLU
     mount: Mount = field(default_factory=Mount)
-    """Where the camera sits by this solution, a step from where the segments' camera does."""
+    """The camera's place by these poses, one step on from that of the segments."""
 
     @classmethod
     def of(cls, segments: Segments) -> Graph:
-        """Of segments with closures, offsets and points; loops and links as noisy as they show."""
+        """By odometry, offsets and measured points, each weighted by how well it fits."""
         stack, stated = Stack.of(segments), Links.of(segments)
-        loops = loops_of(segments.closures, segments.offsets, stack)
-        given: list[Loops | MeasuredPoints] = [*loops]
-        given += [segments.points] if segments.points else []
-        stay = stack.sparse((np.arange(stack.segments), np.full(stack.segments, np.sqrt(_STAY))))
-        graph, links = None, stated
+        loops, links, graph = Loops.of(segments.offsets, stack), stated, None
         for _ in range(_ROUNDS):
-            if graph:
-                links = stated.learned(links, stack, graph.solution, *graph._unknown_links(links))
-            before = graph.solution if graph else None
-            ties = [one.ties(stack, before) for one in given]
-            rows = sparse.csr_array(sparse.vstack([links.ties(stack), *ties, stay]))
-            graph = _solved(rows, stack, before)
+            links = graph.learned(stated, links) if graph else stated
+            before = graph.poses if graph else None
+            rows = sparse.vstack([links.ties(stack), loops.ties(stack, before)])
+            tied = [rows, segments.points.ties(stack, before)] if segments.points else [rows]
+            form = form_of(sparse.vstack(tied), stack)
+            graph = cls.solved(form, stack, before)
+            # Expected information: in the observed one, outliers count.
+            normal = _gauss_newton(form, graph.poses, stack.period)
+            graph = replace(graph, factor=_factor(normal))
         assert graph is not None
-        return replace(graph, mount=graph._mount(segments.mount, links, loops, before))
+        poses, period = graph.poses, stack.period
+        by_loops = loops.by_mount(stack, before, poses)
+        by_mount = np.vstack([links.by_mount(stack, poses), by_loops])
+        by_both = np.real((rows @ derivative(poses, period)).conj().T @ by_mount)
+        followed = by_both.T @ graph.factor.solve(by_both)
+        gradient = np.real(by_mount.conj().T @ (rows @ poses.coefficients(period)))
+        information = np.real(by_mount.conj().T @ by_mount) - followed
+        return replace(graph, mount=segments.mount.stepped(information, gradient))
 
-    def _mount(
-        self, mount: Mount, links: Links, loops: Sequence[Loops], before: Solution | None
-    ) -> Mount:
-        """The mount of the segments a step on, by links and loops that are weighed alike."""
-        stack, solution = self.stack, self.solution
-        rows = sparse.vstack([links.ties(stack), *(one.ties(stack, before) for one in loops)])
-        missed = rows @ solution.coefficients(stack.period)
-        shown = [one.by_mount(stack, before, solution) for one in loops]
-        by_mount = np.vstack([links.by_mount(stack, solution), *shown])
-        by = by_unknowns(rows, solution, stack.period)
-        by_rest = np.real(by.conj().T @ by_mount)
-        return mount.stepped(missed, by_mount, by_rest, self.unknown)
+    @classmethod
+    def solved(cls, form: Any, stack: Stack, start: SegmentPoses | None = None) -> Graph:
+        """The minimum of a form (3N, 3N) near a start, or near the path of the odometry; where it
+        is not proven, that from the smallest eigenvector of the form, if it is better."""
+        x, y, yaw = stack.starts.T
+        zeros = np.zeros(stack.period[-1] + 1)
+        start = start or SegmentPoses(np.exp(1j * yaw), x + 1j * y, zeros)
+        graph = cls.at(form, stack, refined(form, stack, start))
+        if graph.certificate.certified:
+            return graph
+        try:
+            z = _spectral(_at_biases(form, graph.poses.bias, stack.period), stack.segments)
+        except RuntimeError:  # no eigenvector converged
+            return graph
+        start = SegmentPoses(z, np.zeros_like(z), graph.poses.bias)
+        other = cls.at(form, stack, refined(form, stack, start))
+        return min(graph, other, key=lambda each: cost(form, each.poses, stack))
 
-    def unknown(self, columns: Array) -> Array:
-        """The covariance of [Re o, Im o, angles of z, b] (P, P) times columns (P, K)."""
-        found = np.empty(columns.shape)
-        for k in range(0, columns.shape[1], _AT_ONCE):
-            part = np.ascontiguousarray(columns[:, k : k + _AT_ONCE])
-            found[:, k : k + _AT_ONCE] = self.factor.solve(part)
-        return found
+    @classmethod
+    def at(cls, form: Any, stack: Stack, poses: SegmentPoses) -> Graph:
+        """Of poses at a minimum."""
+        factor, _ = _normal(form, poses, stack.period)
+        return cls(stack, poses, proof(form, poses, stack.period), factor)
+
+    def covariance_times(self, columns: Array) -> Array:
+        """The covariance (P, P) times columns (P, K)."""
+        return np.asarray(self.factor.solve(np.ascontiguousarray(columns)))
 
     @property
     def angle_covariance(self) -> Array:
-        """(N, N) rad^2 of the directions, without a rotation of all together."""
+        """(N, N) rad^2 of the directions, relative to the rotation of all together."""
         n, size = self.stack.segments, self.factor.shape[0]
-        own = self.unknown(np.eye(size, n, -2 * n))[2 * n : 3 * n]
-        apart = own - own.mean(0)
-        return np.asarray(apart - apart.mean(1)[:, None])
+        angles = self.covariance_times(np.eye(size, n, -2 * n))[2 * n : 3 * n]
+        centered = angles - angles.mean(0)
+        return np.asarray(centered - centered.mean(1)[:, None])
 
     def covariance(self, rows: Complex) -> Complex:
-        """Per axis (K, K) of rows (K, 3N) times [o, z, -b z], without a motion of the whole map."""
-        moved = self._moved(rows)
-        unknown = self.unknown(moved.real.T) - 1j * self.unknown(moved.imag.T)
-        return np.asarray(moved @ unknown / 2)
+        """(K, K) m^2 per axis of places, rows (K, 3N) times y, relative to the whole map."""
+        by = self._relative(rows)
+        product = self.covariance_times(by.real.T) - 1j * self.covariance_times(by.imag.T)
+        return np.asarray(by @ product / 2)
 
     def variance(self, shares: Array) -> Array:
-        """Of sums of the images' places by shares (K, M) of sum 1, (K,) m^2 over both axes, without
-        a motion of the whole map."""
-        rows = self.stack.place_rows(np.arange(shares.shape[1]), np.ones(shares.shape[1]))
-        return self._variance(self._moved(shares @ rows))
+        """(K,) m^2 over both axes, of averages of the images' places by shares (K, M) of sum 1,
+        relative to the whole map."""
+        return self._variance(self._relative(shares @ self._image_rows))
 
-    def _moved(self, rows: Any) -> Complex:
-        """Derivative (K, P) of rows (K, 3N) times [o, z, -b z] by [Re o, Im o, angles of z, b],
-        without that of a motion of the whole map."""
-        stack, solution = self.stack, self.solution
-        images = stack.place_rows(np.arange(len(stack.images)), np.ones(len(stack.images)))
-        own, whole = (by_unknowns(one, solution, stack.period) for one in (rows, images))
-        places = solution.places(stack)
-        around = places - places.mean()
-        mean = np.asarray(whole.mean(axis=0))
-        turn = np.real(-1j * (around.conj() @ whole)) / np.sum(np.abs(around) ** 2)
-        here = rows @ solution.coefficients(stack.period) - places.mean()
-        return np.asarray(sparse.csr_array(own).toarray() - mean[None] - 1j * np.outer(here, turn))
+    @property
+    def _image_rows(self) -> Any:
+        count = len(self.stack.images)
+        return self.stack.place_rows(np.arange(count), np.ones(count))
 
-    def _unknown_links(self, links: Links) -> tuple[Array, Array]:
-        """Variances (L,) that the solution leaves of turns and, per axis, displacements."""
+    def _relative(self, rows: Any) -> Complex:
+        """Derivative (K, P) of places, rows (K, 3N) times y, without that of a motion of the whole
+        map."""
+        by_y = derivative(self.poses, self.stack.period)
+        by, by_images = rows @ by_y, self._image_rows @ by_y
+        places = self.poses.places(self.stack)
+        arms = places - places.mean()
+        turn = np.real(-1j * (arms.conj() @ by_images)) / np.sum(np.abs(arms) ** 2)
+        here = rows @ self.poses.coefficients(self.stack.period) - places.mean()
+        mean = np.asarray(by_images.mean(axis=0))
+        return np.asarray(sparse.csr_array(by).toarray() - mean[None] - 1j * np.outer(here, turn))
+
+    def learned(self, stated: Links, links: Links) -> Links:
+        """The stated links with the variances that these poses, of some links, show."""
         turns, moves = links.rows(self.stack)
-        # Along the turn: of its complex square the other part is none of the angles'.
-        along = sparse.diags_array(-1j * self.solution.z[links.at + 1].conj()) @ turns
-        return self._left(along, np.real), self._left(moves) / 2
+        # A turn is the part of its complex residual that is square to its direction.
+        along = sparse.diags_array(-1j * self.poses.z[links.at + 1].conj()) @ turns
+        uncertain = self._sampled(along, np.real), self._sampled(moves) / 2
+        y = self.poses.coefficients(self.stack.period)
+        residuals = np.abs(turns @ y) ** 2, np.abs(moves @ y) ** 2 / 2
+        return stated.learned(links, residuals, uncertain)
 
-    def _left(self, rows: Any, part: Callable[[Complex], Any] = np.asarray) -> Array:
-        """Variance (L,) that the solution leaves of a part of rows (L, 3N) times [o, z, -b z]: of
-        some rows, and as those nearby of the others."""
-        shown, count = evenly(rows.shape[0], SHOWN), rows.shape[0]
-        by = part(by_unknowns(rows[shown], self.solution, self.stack.period).toarray())
-        return np.interp(np.arange(count), shown, self._variance(by)) if count else np.zeros(0)
+    def _sampled(self, rows: Any, part: Callable[[Complex], Any] = np.asarray) -> Array:
+        """Variance (L,) of a part of rows (L, 3N) times y: of a sample, interpolated."""
+        count = rows.shape[0]
+        if not count:
+            return np.zeros(0)
+        sample = evenly(count, SAMPLED)
+        by = (rows.tocsr()[sample] @ derivative(self.poses, self.stack.period)).toarray()
+        return np.interp(np.arange(count), sample, self._variance(part(by)))
 
     def _variance(self, by: Complex) -> Array:
-        """Of derivatives (K, P): (K,), that of the real and of the imaginary part together."""
-        parts = [(self.unknown(one.T).T * one).sum(axis=1) for one in (by.real, by.imag)]
-        return np.asarray(parts[0] + parts[1])
+        """(K,) over both axes, of derivatives (K, P)."""
+        x, y = ((self.covariance_times(axis.T).T * axis).sum(1) for axis in (by.real, by.imag))
+        return np.asarray(x + y)
 
 
 def graph_poses(graph: Graph, count: int) -> Array:
     """Poses (count, 3) of the camera, x m, y m, yaw rad, at the images, in a frame of their own;
     NaN for those of no segment."""
-    stack, solution = graph.stack, graph.solution
-    poses, places = np.full((count, 3), np.nan), solution.places(stack)
-    yaws = stack.yaws(solution)
-    poses[stack.images] = np.column_stack([places.real, places.imag, yaws])
+    stack, places = graph.stack, graph.poses.places(graph.stack)
+    poses = np.full((count, 3), np.nan)
+    poses[stack.images] = np.column_stack([places.real, places.imag, stack.yaws(graph.poses)])
     return poses
 
 
-def by_unknowns(rows: Any, now: Solution, period: NDArray[np.int64]) -> Any:
-    """Derivative (L, P) of rows (L, 3N) times [o, z, -b z] by [Re o, Im o, angles of z, b]."""
-    rows, n = sparse.csr_array(rows), len(now.z)
-    own, by_bias = rows[:, :n], rows[:, 2 * n :] * now.z[None]
-    turned = (rows[:, n : 2 * n] - rows[:, 2 * n :] * now.bias[period][None]) * (1j * now.z)[None]
-    periods = sparse.csr_array((np.ones(n), (np.arange(n), period)), (n, len(now.bias)))
-    return sparse.hstack([own, 1j * own, turned, -by_bias @ periods]).tocsr()
+def form_of(rows: Any, stack: Stack) -> Any:
+    """G (3N, 3N) of rows (L, 3N), with the weak prior of origins."""
+    n = stack.segments
+    weak = sparse.diags_array(np.repeat([_ORIGIN_PRIOR, 0.0, 0.0], n))
+    return sparse.csr_array(rows.conj().T @ rows + weak)
 
 
-def _solved(rows: Any, stack: Stack, before: Solution | None) -> Graph:
-    """The least squares of rows (L, 3N), from the solution before or from odometry's own path; from
-    the smallest eigenvector where that is not proven to be the best."""
-    x, y, yaw = stack.starts.T
-    start = before or Solution(np.exp(1j * yaw), x + 1j * y, np.zeros(stack.period[-1] + 1))
-    graph = _refined(rows, stack, start)
-    if graph.certificate.certified:
-        return graph
-    try:
-        z = _spectral(_form(rows, graph.solution.bias, stack.period), stack.segments)
-    except RuntimeError:  # no vector was found: what there is stays, unproven
-        return graph
-    other = _refined(rows, stack, Solution(z, np.zeros_like(z), graph.solution.bias))
-    return min(graph, other, key=lambda one: _cost(rows, one.solution, stack))
+def cost(form: Any, poses: SegmentPoses, stack: Stack) -> float:
+    """y^H G y, and the squares of the biases over their prior."""
+    y = poses.coefficients(stack.period)
+    return float(np.vdot(y, form @ y).real + np.sum((poses.bias / YAW_BIAS_STD) ** 2))
 
 
-def _refined(rows: Any, stack: Stack, start: Solution) -> Graph:
-    """Gauss and Newton's steps, halved until they are a descent."""
-    now, n, period, cost = start, stack.segments, stack.period, _cost(rows, start, stack)
+def refined(form: Any, stack: Stack, start: SegmentPoses) -> SegmentPoses:
+    """The minimum near a start, by Newton's steps, halved until they descend."""
+    poses, n, least = start, stack.segments, cost(form, start, stack)
     for _ in range(_STEPS):
-        factor, slope = _normal(rows, now, period)
-        step, size, new = factor.solve(-slope), 1.0, np.inf
-        for _ in range(_HALVED):
-            moved = size * step
-            tried = Solution(
-                now.z * np.exp(1j * moved[2 * n : 3 * n]),
-                now.o + moved[:n] + 1j * moved[n : 2 * n],
-                now.bias + moved[3 * n :],
+        factor, gradient = _normal(form, poses, stack.period)
+        step = factor.solve(-gradient)
+        squares = np.abs(poses.coefficients(stack.period)) ** 2
+        rounding = 1e-14 * float(form.diagonal().real @ squares)
+        for halving in range(_HALVINGS):
+            moved = step / 2**halving
+            tried = SegmentPoses(
+                poses.z * np.exp(1j * moved[2 * n : 3 * n]),
+                poses.o + moved[:n] + 1j * moved[n : 2 * n],
+                poses.bias + moved[3 * n :],
             )
-            if (new := _cost(rows, tried, stack)) <= cost * (1 + 1e-12):
+            new = cost(form, tried, stack)
+            if new <= least + rounding:
                 break
-            size /= 2
         else:
             break
-        now, cost = tried, new
-        if np.abs(step[2 * n :]).max() < _CONVERGED:
+        poses, least = tried, new
+        if -gradient @ step < _CONVERGED:
             break
-    return Graph(stack, now, proof(rows, now, period), factor)
+    return poses
 
 
-def _cost(rows: Any, solution: Solution, stack: Stack) -> float:
-    missed = rows @ solution.coefficients(stack.period)
-    return float(np.sum(np.abs(missed) ** 2) + np.sum((solution.bias / YAW_BIAS_STD) ** 2))
+def derivative(poses: SegmentPoses, period: Indices) -> Any:
+    """Of y = [o, z, -b z] by [Re o, Im o, angles of z, b]: (3N, P)."""
+    n = len(period)
+    origins, turned = sparse.eye_array(n), sparse.diags_array(1j * poses.z)
+    by_bias = sparse.csr_array((-poses.z, (np.arange(n), period)), (n, len(poses.bias)))
+    drifted = sparse.diags_array(-1j * poses.bias[period] * poses.z)
+    return sparse.block_array(
+        [
+            [origins, 1j * origins, None, None],
+            [None, None, turned, None],
+            [None, None, drifted, by_bias],
+        ]
+    ).tocsr()
 
 
-def _normal(rows: Any, now: Solution, period: NDArray[np.int64]) -> tuple[SuperLU, Array]:
-    """The factor of the normal equations, and half the gradient of the cost (P,).
+def _gauss_newton(form: Any, poses: SegmentPoses, period: Indices) -> Any:
+    """The normal equations (P, P). A rotation of all segments costs nothing: the first direction
+    is held."""
+    n, by = len(period), derivative(poses, period)
+    prior = np.repeat([0.0, _DIRECTION_PRIOR, YAW_BIAS_STD**-2], [2 * n, n, len(poses.bias)])
+    prior[2 * n] = 1.0
+    return (by.conj().T @ form @ by).real + sparse.diags_array(prior)
 
-    Turning all together costs nothing: the first direction is held, for this step, and any that
-    nothing ties to the others is known to be unknown.
-    """
-    n, by = len(now.z), by_unknowns(rows, now, period)
-    own = np.concatenate([np.zeros(3 * n), np.full(len(now.bias), YAW_BIAS_STD**-2)])
-    slope = np.real(by.conj().T @ (rows @ now.coefficients(period)))
-    slope += own * np.concatenate([np.zeros(3 * n), now.bias])
-    own[2 * n : 3 * n] = _UNTIED
-    own[2 * n] = 1.0
-    return _factor((by.conj().T @ by).real + sparse.diags_array(own)), slope
+
+def _normal(form: Any, poses: SegmentPoses, period: Indices) -> tuple[SuperLU, Array]:
+    """The factor of half the Hessian of the cost, or of Gauss and Newton's where that is not
+    positive, and half the gradient (P,)."""
+    n, y = len(period), poses.coefficients(period)
+    pull = form @ y
+    gradient = np.real(derivative(poses, period).conj().T @ pull)
+    gradient[3 * n :] += poses.bias / YAW_BIAS_STD**2
+    curvature = -np.real(y[n:].conj() * pull[n:]).reshape(2, n).sum(0)
+    mixed = np.real(1j * poses.z.conj() * pull[2 * n :])
+    angles, biases = 2 * n + np.arange(n), 3 * n + period
+    at = np.concatenate([angles, angles, biases]), np.concatenate([angles, biases, angles])
+    gauss_newton = _gauss_newton(form, poses, period)
+    values = np.concatenate([curvature, mixed, mixed])
+    factor = _factor(gauss_newton + sparse.csr_array((values, at), gauss_newton.shape))
+    if factor.U.diagonal().min() <= 0.0:
+        factor = _factor(gauss_newton)
+    return factor, gradient
 
 
 def _factor(symmetric: Any) -> SuperLU:
-    """Of a sparse matrix, without exchanging rows: the signs of its pivots are its own."""
+    """Of a matrix, without exchange of rows: the signs of its pivots are its inertia."""
     options = {'SymmetricMode': True}
-    return splu(symmetric.tocsc(), 'MMD_AT_PLUS_A', diag_pivot_thresh=0.0, options=options)
+    return splu(
+        sparse.csc_array(symmetric), 'MMD_AT_PLUS_A', diag_pivot_thresh=0.0, options=options
+    )
 
 
-def _form(rows: Any, bias: Array, period: NDArray[np.int64]) -> Any:
-    """S (2N, 2N) at the biases."""
+def _at_biases(form: Any, bias: Array, period: Indices) -> Any:
+    """S (2N, 2N), the form in [o, z] at the biases."""
     n = len(period)
-    turned = rows[:, n : 2 * n] - rows[:, 2 * n :] * bias[period][None]
-    both = sparse.hstack([rows[:, :n], turned]).tocsr()
-    return (both.conj().T @ both).tocsr()
+    by_z = sparse.vstack([sparse.eye_array(n), sparse.diags_array(-bias[period])])
+    y = sparse.block_diag([sparse.eye_array(n), by_z], 'csr')
+    return y.T @ form @ y
 
 
 def _real(hermitian: Any) -> Any:
     """The same form of real and imaginary parts."""
-    real, imag = hermitian.real, hermitian.imag
-    return sparse.block_array([[real, -imag], [imag, real]]).tocsc()
+    real, imag = (sparse.csc_array(part) for part in (hermitian.real, hermitian.imag))
+    return sparse.block_array([[real, -imag], [imag, real]])
 
 
-def proof(rows: Any, now: Solution, period: NDArray[np.int64]) -> Certificate:
-    """The least pivot of S - diag(0, Lambda), over the largest entry: it is positive where all
-    eigenvalues are."""
-    n, form = len(period), _form(rows, now.bias, period)
-    pull = (form @ np.concatenate([now.o, now.z]))[n:]
-    least = np.concatenate([np.zeros(n), np.real(now.z.conj() * pull)])
-    scale = max(float(np.real(form.diagonal()[n:]).max()), 1.0)
-    shift = np.concatenate([np.zeros(n), np.full(n, CERTIFICATE_TOLERANCE * scale)])
-    factor = _factor(_real(form - sparse.diags_array(least - shift)))
+def proof(form: Any, poses: SegmentPoses, period: Indices) -> Certificate:
+    """The certificate of poses at a minimum of a form (3N, 3N)."""
+    n, at_biases = len(period), _at_biases(form, poses.bias, period)
+    pull = (at_biases @ np.concatenate([poses.o, poses.z]))[n:]
+    multipliers = np.append(np.zeros(n), np.real(poses.z.conj() * pull))
+    entries = np.real(at_biases.diagonal())
+    scale = max(float(entries[n:].max()), 1.0)
+    # A motion of all origins costs next to nothing: rounding would decide on the sign of its pivot.
+    shift = np.repeat([1e-12 * entries[:n].max(), CERTIFICATE_TOLERANCE * scale], n)
+    factor = _factor(_real(at_biases - sparse.diags_array(multipliers - shift)))
     return Certificate(float(factor.U.diagonal().min()) / scale)
 
 
 def _spectral(form: Any, n: int) -> Complex:
-    """Phases of the smallest eigenvector of H: of what the inverse of the form has for z."""
+    """Phases of the eigenvector of the smallest eigenvalue, of the form in z at the best o."""
     factor = _factor(_real(form + 1e-12 * form.diagonal().real.max() * sparse.eye_array(2 * n)))
 
-    def apply(z: Array) -> Array:
+    def inverse_times(z: Array) -> Array:
         right = np.zeros(4 * n)
         right[n : 2 * n], right[3 * n :] = z[:n], z[n:]
-        found = factor.solve(right)
-        return np.concatenate([found[n : 2 * n], found[3 * n :]])
+        solved = factor.solve(right)
+        return np.concatenate([solved[n : 2 * n], solved[3 * n :]])
 
-    operator = LinearOperator((2 * n, 2 * n), apply, dtype=float)
+    operator = LinearOperator((2 * n, 2 * n), inverse_times, dtype=float)
     vector = eigsh(operator, 1, v0=np.ones(2 * n))[1][:, 0]
-    return unit(vector[:n] + 1j * vector[n:])
+    z = vector[:n] + 1j * vector[n:]
+    size = np.abs(z)
+    return np.where(size > 0, z / np.where(size > 0, size, 1.0), 1.0)

@@ -1,14 +1,14 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The map from features to positions as models save it: few products for one image.
+"""The map from features to positions as models save it.
 
-With k the kernel of an image (see basis.py), phi = [k W, 1] its expansion, and w the weights that
-are learned, everything that is predicted is linear or quadratic in k:
+With k the kernel of an image (see basis.py), phi = [k W, 1] its expansion, and w the learned
+weights, every prediction is linear or quadratic in k:
 
     position  k W w + w_0,    variance  c + k a - |k C|^2,    C C^T = W (p I - Q) W^T
 
 with Q the weights' posterior covariance, below its prior p I. Without a prior, C C^T = W Q W^T is
-added instead. So two m x m products become one triangular one, which reads a quarter of the memory.
+added instead.
 """
 
 from __future__ import annotations
@@ -22,17 +22,15 @@ from sfa_localization.data.errors import DataError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.basis import Basis, basis_from
 
-_BLOCK = 128  # columns of a triangular matrix that are multiplied at once
-
 
 @dataclass(frozen=True, slots=True)
 class MetricMap:
     """From slow features to meters in the map frame, with covariance.
 
     `linear` (k, 3) and `constant` (3,) give the position and the linear part of the variance;
-    `factor` (k, k) is C, lower triangular in Fortran order; `floor` is a point's variance, m^2,
-    `inflation` a factor on the covariance that makes left-out segments consistent, and `common_m`
-    the standard deviation along each axis of what the drive's positions have in common errors.
+    `factor` (k, k) is C, lower triangular; `floor` is a point's variance, m^2. `inflation`
+    multiplies the covariance to make errors of held-out images consistent. `common_m` is the
+    standard deviation per axis of the errors that all positions of the drive share.
     """
 
     basis: Basis
@@ -53,22 +51,21 @@ class MetricMap:
         inflation: float,
         common_m: float,
     ) -> MetricMap:
-        """Compile a map of weights that were learned, `mean` (m, 2) m, with the posterior
-        covariance noise_m^2 root root^T (m, m); `noise_m` is the standard deviation of an image's
-        residual per axis."""
+        """Compile a map of learned weights, `mean` (m, 2) m, with the posterior covariance
+        noise_m^2 root root^T (m, m); `noise_m` is the standard deviation of an image's residual per
+        axis."""
         floor = noise_m**2
         prior = floor * basis.prior
         q = floor * (root @ root.T)
         inner = _sign(basis) * (q[:-1, :-1] - prior * np.eye(len(q) - 1))
         quadratic = basis.turn @ inner @ basis.turn.T
-        # Rounded as model files hold it: standard deviations change by 0.5 % at most.
-        factor = lower_root((quadratic + quadratic.T) / 2).astype(np.float32)
+        # Rounded as in model files: standard deviations change by 0.5 % at most.
+        factor = lower_root((quadratic + quadratic.T) / 2).astype(np.float32).astype(float)
         rows = np.column_stack([mean, 2 * q[:, -1]])
         constant = rows[-1].copy()
         constant[2] = q[-1, -1] + floor + prior
         linear = basis.turn @ rows[:-1]
-        rounded = np.asfortranarray(factor, float)
-        return cls(basis, linear, constant, rounded, floor, inflation, common_m)
+        return cls(basis, linear, constant, factor, floor, inflation, common_m)
 
     @property
     def features(self) -> int:
@@ -85,9 +82,9 @@ class MetricMap:
             raise DataError(f'the map reads {self.features} slow features, not {features.shape[1]}')
         kernel = self.basis.kernel(features)
         combined = kernel @ self.linear + self.constant
-        quadratic = _sign(self.basis) * squares(kernel, self.factor)
-        own = np.maximum(combined[:, 2] + quadratic, self.floor)
-        variance = self.inflation * own + self.common_m**2
+        quadratic = _sign(self.basis) * np.square(kernel @ self.factor).sum(1)
+        variance = np.maximum(combined[:, 2] + quadratic, self.floor)
+        variance = self.inflation * variance + self.common_m**2
         return combined[:, :2], variance[:, None, None] * np.eye(2)
 
     def to_arrays(self) -> Arrays:
@@ -124,14 +121,3 @@ def lower_root(symmetric: Array) -> Array:
         values, axes = np.linalg.eigh(symmetric)
         root = axes * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(np.linalg.qr(root.T, mode='r')).T
-
-
-def squares(rows: Array, factor: Array) -> Array:
-    """|k L|^2 (M,) of rows k (M, N), reading little more than the lower triangle.
-
-    `factor` (N, N) is in Fortran order.
-    """
-    sums = np.zeros(len(rows))
-    for at in range(0, len(factor), _BLOCK):
-        sums += np.square(rows[:, at:] @ factor[at:, at : at + _BLOCK]).sum(1)
-    return sums

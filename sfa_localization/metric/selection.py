@@ -1,6 +1,7 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Select the map's basis by its evidence, and judge maps by leaving out segments of the drive."""
+"""Select the basis of the map, and judge maps at parts of the drive that they were learned
+without."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import optimize
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices, align_complex
@@ -16,150 +18,148 @@ from sfa_localization.metric.basis import PAPER_FEATURES, Basis, Monomials, Proc
 from sfa_localization.metric.fitted_map import place_variance, plane
 from sfa_localization.metric.forecast import Forecast, ground_distances, importance, nearest_used
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
-from sfa_localization.metric.phases import phase_cost, refine
-from sfa_localization.metric.quadratic_form import Ridge
+from sfa_localization.metric.pose_graph import cost, refined
+from sfa_localization.metric.ridge import Ridge
 from sfa_localization.metric.stack import Stack
 
 INDUCING_POINTS = 1000
-"""Most images that span the Gaussian process: with half as many more it is no better, and the model
-file and the time of an estimate are larger."""
+"""Most images that span the Gaussian process: with half as many more it is no better."""
 RIDGE = 1e-4
-"""Penalty of monomials, over the mean square of an image's residual: from 0 to 1e-3, maps are as
+"""Penalty of monomials, over the mean square of an image's residual: up to 1e-3, maps are as
 good."""
-LEFT_OUT_FOLDS = 8
-"""Parts of the drive that are left out in turn."""
-LEFT_OUT_LENGTH_M = 10.0
-"""Longest stretch that is left out as a whole: longer gaps do not occur in a covered area."""
-# Inducing points while length and noise are searched; with 300 the search ends with too much noise.
+HELD_OUT_FOLDS = 8
+"""Parts of the drive that are held out in turn."""
+HELD_OUT_LENGTH_M = 10.0
+"""Longest stretch that is held out as a whole: a covered area has no longer gaps."""
+# Inducing points of the search: with 300 it ends with too much noise.
 _SEARCH_POINTS = 800
-# Length (in typical distances of two images) and noise (over the signal) that the search starts at.
+# Start and bounds of length (in typical distances of two images) and noise (over the signal): with
+# less, rounded models err.
 _FIRST_HYPER = (1.0, 1e-3)
-_LENGTH_BOUNDS = (0.05, 20.0)
-_NOISE_BOUNDS = (1e-6, 1.0)
+_BOUNDS = ((0.05, 20.0), (1e-5, 1.0))
 
 
 @dataclass(frozen=True, slots=True)
-class LeftOut:
-    """Predictions of images whose segments the map was learned without, row by row."""
+class HeldOut:
+    """Predictions of M images by maps that were learned without their part of the drive."""
 
     errors: Complex
-    """(M,) m: where the solution of all data puts an image minus where that map does."""
+    """(M,) m: where the segments put an image minus where that map does."""
     variances: Array
-    """(M,) of the prediction per axis, before inflation, m^2."""
+    """(M,) m^2, of the prediction per axis, before inflation."""
     forecast: Forecast
     explained: float
     """Share of the spread of the places that the features explain."""
 
     @property
     def variance(self) -> float:
-        """Of the position of an image that was left out, m^2 per axis."""
-        return float(self.forecast.weight @ self.forecast.left_out**2) / 2
+        """m^2 per axis, of the prediction of an image that was held out."""
+        return float(self.forecast.weight @ self.forecast.held_out**2) / 2
 
     @property
     def inflation(self) -> float:
-        """Factor on the covariance of the map that makes these consistent, at least 1."""
+        """Multiply the map's covariance by this to make its errors consistent; at least 1."""
         ratio = np.abs(self.errors) ** 2 / self.variances
         return max(needed_factor(ratio, self.forecast.weight), 1.0)
 
 
 def folds(stack: Stack, seed: int) -> Indices:
-    """(M,) by which part of the drive each row of the stack is left out: whole segments, in
+    """(M,) the part of the drive in which each row of the stack is held out: whole segments, in
     stretches of the drive.
 
-    Stretches of a short drive are shorter: there are LEFT_OUT_FOLDS parts, as far as there are
-    segments, and always at least two. Segments along one track are left out together. Raises
-    DataError for a drive of one segment.
+    Stretches of a short drive are shorter: there are HELD_OUT_FOLDS parts, as far as there are
+    segments, and at least two. Segments along one track are held out together. Raises DataError for
+    a drive of one segment.
     """
     lengths = stack.sums(stack.steps)
-    length = min(LEFT_OUT_LENGTH_M, lengths.sum() / LEFT_OUT_FOLDS)
+    length = min(HELD_OUT_LENGTH_M, lengths.sum() / HELD_OUT_FOLDS)
     # The middles of the first and the last segment are at least half the drive apart.
     middles = np.cumsum(lengths) - lengths / 2
     stretch = np.floor(middles / max(length, 1e-9)).astype(int)[stack.track]
-    names = np.unique(stretch)
+    names, number = np.unique(stretch, return_inverse=True)
     if len(names) < 2:
         raise DataError(
             f'{lengths.sum():.1f} m of odometry with images leave nothing to check a map with: '
             'drive farther'
         )
-    parts = min(LEFT_OUT_FOLDS, len(names))
     order = np.random.default_rng(seed).permutation(len(names))
-    fold = np.empty(len(names), int)
-    fold[order] = np.arange(len(names)) % parts
-    return np.asarray(fold[np.searchsorted(names, stretch)][stack.owner])
+    part = np.empty(len(names), int)
+    part[order] = np.arange(len(names)) % min(HELD_OUT_FOLDS, len(names))
+    return np.asarray(part[number][stack.owner])
 
 
-def leave_out(fit: MapFit) -> LeftOut:
-    """Predict each fold from the others; the directions are solved again without its images.
+def _parts(fit: MapFit) -> Iterator[Indices]:
+    """The rows of each part."""
+    part = folds(fit.stack, fit.problem.seed)
+    return (np.flatnonzero(part == number) for number in np.unique(part))
 
-    The left-out segments keep their odometry, so the frame stays the same; predictions are
-    compared with where the solution of all data puts the images.
+
+def hold_out(fit: MapFit) -> HeldOut:
+    """Predict each part of the drive from the others; eq. 1 is solved again without its images.
+
+    The segments of the part keep their odometry, which keeps the frame. Predictions are compared
+    with the places by all data.
     """
     stack, places = fit.stack, fit.places
-    errors = np.zeros(len(stack.images), complex)
-    variances = np.zeros(len(stack.images))
-    part = folds(stack, fit.problem.seed)
-    for rows in (np.flatnonzero(part == number) for number in np.unique(part)):
-        ridge, solution = fit.without(rows)
-        found, left = solution.places(stack), fit.ridge.expanded[rows]
-        turn, shift = align_complex(found, places, ridge.weights)
-        errors[rows] = places[rows] - (turn * (left @ ridge.fitted(found)) + shift)
-        spread = (ridge.whitened(left) ** 2).sum(0)
-        variances[rows] = fit.variance * (1.0 / fit.ridge.weights[rows] + spread)
+    errors, variances = np.zeros(len(places), complex), np.zeros(len(places))
+    for rows in _parts(fit):
+        ridge, poses = fit.without(rows)
+        others, expanded = poses.places(stack), fit.ridge.expanded[rows]
+        turn, shift = align_complex(others, places, ridge.weights)
+        errors[rows] = places[rows] - (turn * (expanded @ ridge.fitted(others)) + shift)
+        by_weights = (ridge.whitened(expanded) ** 2).sum(0)
+        variances[rows] = fit.variance * (1.0 / fit.ridge.weights[rows] + by_weights)
     distances, weight = on_the_ground(fit)
     drive_std = np.sqrt(place_variance(fit))
-    expected = Forecast(plane(places), np.abs(errors), drive_std, weight, distances)
+    forecast = Forecast(plane(places), np.abs(errors), drive_std, weight, distances)
     spread_m2 = max(float(plane(places).var(0).sum()), 1e-12)
     explained = 1.0 - float(weight @ np.abs(errors) ** 2) / spread_m2
-    return LeftOut(errors, variances, expected, explained)
+    return HeldOut(errors, variances, forecast, explained)
 
 
 def evidence(basis: Basis, now: MapFit) -> float:
-    """Negative log evidence of a Gaussian process's hyper-parameters, at their best directions.
+    """Negative log evidence of a Gaussian process's hyper-parameters, at their best poses.
 
     Origins have flat priors (restricted likelihood); the signal's variance is profiled out.
     """
-    ridge, noise, z = Ridge.of(basis, now.problem.features), float(basis.ridge[0]), now.solution.z
-    form = now.form(ridge)
-    h = form.at(now.solution.bias)
-    cost = 2.0 * phase_cost(h, refine(h, z))
-    points, segments = len(ridge.expanded), len(z)
-    own = form.own + np.trace(form.own) / segments**2
-    freedom = points - segments
+    ridge, noise, stack = Ridge.of(basis, now.problem.features), float(basis.ridge[0]), now.stack
+    form, segments = now.form(ridge), stack.segments
+    squares = now.image_variance * cost(form, refined(form, stack, now.graph.poses), stack)
+    origins = now.image_variance * form[:segments, :segments].real
+    points, freedom = len(ridge.expanded), len(ridge.expanded) - segments
     return (
-        freedom * float(np.log(cost / noise / freedom))
+        freedom * float(np.log(squares / noise / freedom))
         + (points - len(basis.ridge) + 1 - segments) * float(np.log(noise))
         - float(np.log(ridge.weights).sum())
         + ridge.log_determinant
-        + float(np.linalg.slogdet(own)[1])
+        + float(np.linalg.slogdet(origins + np.trace(origins) / segments**2)[1])
     )
 
 
 def on_the_ground(fit: MapFit) -> tuple[Array, Array]:
     """Distances (K,) m of the covered ground to the nearest image, and the weights (M,) by which
-    images that are left out stand for it."""
+    held-out images represent it."""
     places, seed = plane(fit.places), fit.problem.seed
     distances = ground_distances(places, np.random.default_rng(seed))
     return distances, importance(nearest_used(places, folds(fit.stack, seed)), distances)
 
 
-def left_out_error(basis: Basis, now: MapFit, weight: Array) -> float:
-    """Mean error, m, by a weight (M,), of images left out of a regression to places that are known.
+def held_out_error(basis: Basis, now: MapFit, weight: Array) -> float:
+    """Mean error, m, by a weight (M,), of held-out images in a regression to the places of now.
 
     The evidence would take neighbors that err alike for proof of little noise.
     """
-    ridge, places, error = Ridge.of(basis, now.problem.features), now.places, 0.0
-    part = folds(now.stack, now.problem.seed)
-    for rows in (np.flatnonzero(part == number) for number in np.unique(part)):
-        found = ridge.expanded[rows] @ ridge.without(rows).fitted(places)
-        error += float(weight[rows] @ np.abs(places[rows] - found))
-    return error
+    ridge, places = Ridge.of(basis, now.problem.features), now.places
+    return sum(
+        float(weight[rows] @ np.abs(places[rows] - predicted))
+        for rows in _parts(now)
+        for predicted in [ridge.expanded[rows] @ ridge.without(rows).fitted(places)]
+    )
 
 
 def feature_scale(features: Array, stack: Stack, count: int) -> Array:
-    """Weight (count,) of each feature in the kernel: slower features count for more.
-
-    A unit length is the typical distance of two images.
-    """
+    """Weight (count,) of each feature in the kernel, larger for slower ones; a unit length is the
+    typical distance of two images."""
     chosen = features[:, :count]
     same = stack.owner[1:] == stack.owner[:-1]
     variance, std = chosen.var(axis=0), chosen.std(axis=0)
@@ -171,10 +171,10 @@ def feature_scale(features: Array, stack: Stack, count: int) -> Array:
 
 
 def choose(problem: MetricProblem, scale: Array | None = None) -> MapFit:
-    """The fit of the basis that the settings name, of a Gaussian process the likeliest.
+    """The fit of the basis in the settings; a Gaussian process has the length and noise of the best
+    evidence or, where a graph gives the places, of the least error of held-out images.
 
-    `scale` (K,) weights the features of a Gaussian process, in which a unit length then is the
-    typical distance of two images; without it their slowness does.
+    `scale` (K,) weights the features of a Gaussian process; without it, their slowness does.
     """
     available, asked = problem.features.shape[1], problem.config.slow_features
     if problem.config.metric_map == 'monomials':
@@ -182,12 +182,7 @@ def choose(problem: MetricProblem, scale: Array | None = None) -> MapFit:
         return problem.fit(Monomials.fit(problem.features, count, RIDGE))
     if scale is None:
         scale = feature_scale(problem.features, problem.stack, asked or available)
-    return _choose_process(problem, scale)
-
-
-def _choose_process(problem: MetricProblem, scale: Array) -> MapFit:
-    """Length and noise by the evidence, or, where places are known, by images left out; with fewer
-    inducing points: they rank alike."""
+    # Length and noise, with fewer inducing points.
     scaled = problem.features[:, : len(scale)] * scale
     points = scaled[spread(scaled, min(_SEARCH_POINTS, INDUCING_POINTS))]
 
@@ -196,39 +191,24 @@ def _choose_process(problem: MetricProblem, scale: Array) -> MapFit:
 
     now = problem.fit(make(*_FIRST_HYPER), None, 3)
     if problem.graph is None:
-        length, noise = _descend(lambda *pair: evidence(make(*pair), now))
+        length, noise = _searched(lambda *pair: evidence(make(*pair), now))
     else:
         weight = on_the_ground(now)[1]
-        length, noise = _descend(lambda *pair: left_out_error(make(*pair), now, weight))
+        length, noise = _searched(lambda *pair: held_out_error(make(*pair), now, weight))
     basis = Process.fit(problem.features, scale / length, noise, INDUCING_POINTS)
     return problem.fit(basis, now)
 
 
-def _descend(judge: Callable[[float, float], float]) -> tuple[float, float]:
-    """Coordinate descent by factors, over length and noise."""
-    costs: dict[tuple[float, float], float] = {}
-    hyper = _FIRST_HYPER
-
-    def cost(pair: tuple[float, float]) -> float:
-        if pair not in costs:
-            costs[pair] = judge(*pair)
-        return costs[pair]
-
-    for factor in (2.0, 1.4):
-        while True:
-            best = min(_around(hyper, factor), key=cost)
-            if not cost(best) < cost(hyper):
-                break
-            hyper = best
-    return hyper
-
-
-def _around(hyper: tuple[float, float], factor: float) -> Iterator[tuple[float, float]]:
-    """Neighbors of length and noise within the bounds."""
-    length, noise = hyper
-    for step in (factor, 1 / factor):
-        if _LENGTH_BOUNDS[0] < length * step < _LENGTH_BOUNDS[1]:
-            yield length * step, noise
-        if _NOISE_BOUNDS[0] < noise * step**2 < _NOISE_BOUNDS[1]:
-            yield length, noise * step**2
-    yield hyper
+def _searched(judge: Callable[[float, float], float]) -> tuple[float, float]:
+    """Length and noise of the least cost, to about 20 %."""
+    start = np.log(_FIRST_HYPER)
+    simplex = start + np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 1.4]])
+    best = optimize.minimize(
+        lambda logarithms: judge(*np.exp(logarithms).tolist()),
+        start,
+        method='Nelder-Mead',
+        bounds=np.log(_BOUNDS),
+        options={'initial_simplex': simplex, 'xatol': 0.2, 'fatol': np.inf},
+    )
+    length, noise = np.exp(best.x).tolist()
+    return length, noise

@@ -1,19 +1,19 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is unknown of a drive, and what its images say of that.
+"""The images of all segments, and the unknown poses that put them on the map.
 
 With p = x + i y in meters and z_n = exp(i alpha_n), image m of segment n lies at
 
     o_n + z_n (q_nm - b drift_nm)
 
 with the odometry's path q_nm in the segment, d_nm of the paper on a straight line, and the yaw-rate
-bias b of its period. That is linear in the unknowns [o, z, -b z] (3N,). Links of odometry
-(links.py), loop closures (loops.py) and measured points (measured_points.py) are sparse rows.
+bias b of its period. That is linear in y = [o, z, -b z] (3N,), and so are the residuals of links of
+odometry (links.py), offsets of loop closures (loops.py) and measured points (measured_points.py).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,8 @@ from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.metric.segments import Segments, assignment
 
 _TRACK_SHARE = 0.5
-"""Of the length of a segment that closures with an earlier one must span: a crossing track has
-closures along half a meter."""
+"""Part of the length of a segment that closures with an earlier one span at least; on a track that
+crosses they span half a meter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +90,13 @@ class Stack:
         """Paths (M,) without the yaw-rate bias of each period (R,)."""
         return np.asarray(self.path - bias[self.period[self.owner]] * self.drift)
 
-    def yaws(self, solution: Solution) -> Array:
-        """Headings (M,) rad of the camera in a solution, without the biases."""
-        own = self.headings - solution.bias[self.period[self.owner]] * self.times_s
-        turned = np.angle(solution.z) + self.camera_yaw
-        return np.asarray(turned[self.owner] + own)
+    def yaws(self, poses: SegmentPoses) -> Array:
+        """Headings (M,) rad of the camera, without the biases."""
+        headings = self.headings - poses.bias[self.period[self.owner]] * self.times_s
+        return np.asarray((np.angle(poses.z) + self.camera_yaw)[self.owner] + headings)
 
     def rows(self, images: Indices) -> Indices:
-        """Rows of images (...) of the drives, -1 for those of no segment."""
+        """Rows of images (...) of all drives; -1 for those of no segment."""
         order = np.argsort(self.images, kind='stable')
         at = np.searchsorted(self.images, images, sorter=order)
         rows = order[np.minimum(at, len(order) - 1)]
@@ -108,23 +107,21 @@ class Stack:
         return np.asarray(np.add.reduceat(rows, self.first, axis=0))
 
     def place_rows(self, rows: Indices, shares: Array) -> Any:
-        """Rows (L, 3N) whose products with [o, z, -b z] are sums of places by `shares`: of images,
-        `rows` (L,) or (L, K) of the stack.
-        """
+        """Rows (L, 3N) whose products with [o, z, -b z] are sums, by `shares`, of the places of
+        images in `rows` (L,) or (L, K) of the stack."""
         n, owner = self.segments, self.owner[rows]
         places, drift = shares * self.path[rows], shares * self.drift[rows]
         return self.sparse((owner, shares), (n + owner, places), (2 * n + owner, drift))
 
     def facing_rows(self, rows: Indices, shares: Array | Complex) -> Any:
-        """The same (L, 3N) of the directions that the images face, exp(i yaw): by how much what is
-        one meter ahead of all images differs from their places; complex shares turn them."""
+        """The same (L, 3N) of the directions exp(i yaw) that the images face; complex shares turn
+        them."""
         n, owner, facing = self.segments, self.owner[rows], np.exp(1j * self.headings[rows])
         drift = 1j * self.times_s[rows] * facing
         return self.sparse((n + owner, shares * facing), (2 * n + owner, shares * drift))
 
     def sparse(self, *parts: tuple[Indices, Array | Complex]) -> Any:
-        """Rows (L, 3N) of [o, z, -b z] from columns and values, (L,) or (L, K); equal columns add
-        up."""
+        """Rows (L, 3N) of columns and values, (L,) or (L, K); equal columns add up."""
         columns, values = (np.column_stack(side) for side in zip(*parts, strict=True))
         rows = np.repeat(np.arange(len(columns)), columns.shape[1])
         entries = values.astype(complex).ravel(), (rows, columns.ravel())
@@ -132,14 +129,12 @@ class Stack:
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
-    """Directions z (N,), origins o (N,), biases (R,) rad/s of the periods; and the quadratic form
-    H (N, N) of the directions, where these are not those of a sparse graph."""
+class SegmentPoses:
+    """Directions z (N,), origins o (N,) m, and yaw-rate biases (R,) rad/s of the periods."""
 
     z: Complex
     o: Complex
     bias: Array
-    h: Complex = field(default_factory=lambda: np.zeros((0, 0), complex))
 
     def places(self, stack: Stack) -> Complex:
         """Where the segments put the images (M,), meters."""
@@ -154,25 +149,25 @@ class Solution:
 def tracks(segments: Segments) -> Indices:
     """For each of the N segments the first segment along the same track (N,): mostly itself.
 
-    A part of the drive that is left out to check a map stands for places that were never seen.
-    Where a later drive follows the same track, perhaps in another light, its images would give the
-    answer away: a map that is learned without one segment must do without both.
+    A part of the drive that is held out to check a map stands for places that were never seen.
+    Where a later drive follows the same track, its images would give the place away: both are held
+    out together.
     """
-    track = np.arange(len(segments))
-    pairs = segments.closures.images
+    track, pairs = np.arange(len(segments)), segments.closures.images
     if not len(pairs):
         return track
     count = max(int(pairs.max()), max(int(s.images.max()) for s in segments)) + 1
-    owner = assignment(segments, count)
-    both = owner[pairs]
+    both = assignment(segments, count)[pairs]
     order = np.argsort(both, axis=1)
     earlier, later = np.take_along_axis(both, order, axis=1).T
     images = np.take_along_axis(pairs, order, axis=1)[:, 1]
     for n, segment in enumerate(segments):
-        own = (later == n) & (earlier >= 0) & (earlier < n)
-        found = int(np.bincount(earlier[own]).argmax()) if own.any() else -1
-        near = np.abs(earlier[own] - found) <= 1
-        path = np.abs(segment.path[np.isin(segment.images, images[own][near])])
+        chosen = (later == n) & (earlier >= 0) & (earlier < n)
+        if not chosen.any():
+            continue
+        first = int(np.bincount(earlier[chosen]).argmax())
+        near = np.abs(earlier[chosen] - first) <= 1
+        path = np.abs(segment.path[np.isin(segment.images, images[chosen][near])])
         if len(path) and np.ptp(path) >= _TRACK_SHARE * np.ptp(np.abs(segment.path)):
-            track[n] = track[found]
+            track[n] = track[first]
     return track

@@ -1,16 +1,15 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the map of a model reads: a lower layer's map, turned by the heading of keyframes.
+"""The features of the map that a model saves: a lower layer's output, turned to heading 0.
 
-Slow features are the same at every heading, and so lose whatever depends on the heading. Once the
-heading is known, a lower layer's map can be turned until its columns point in fixed directions of
-the map frame. Its principal components then depend on the place alone, and hold more of it than
-the slow features do. So metric learning runs twice: on slow features, for certified headings; and
-on maps turned by these, certified in the same way, for the map that the model holds.
+Slow features do not change with the heading, and lose what does. Once the headings of images are
+known, the maps of a lower layer can be turned until their columns point in fixed directions. Their
+principal components depend on the place alone, and hold more of it than slow features. So metric
+learning runs twice: on slow features, for certified headings, and on maps turned by these.
 
 A layer's map is kept as its harmonics over the columns, F_k = sum_c Z[c] exp(-2 pi i k c / R). The
 robot's turn by phi multiplies F_k by exp(i k sign phi), sign -1 where columns grow clockwise,
-so turning back is exact also by fractions of a column.
+so that it is undone exactly, also by fractions of a column.
 """
 
 from __future__ import annotations
@@ -31,16 +30,14 @@ Vectors = NDArray[np.float32]
 
 DIMENSIONS = 32
 """Principal components that the map reads."""
-# Three headings with the mean and the variance of an uncertain one, in standard deviations, and
-# their weights: of one of which nothing is known, they are a third of a turn apart.
-_APART, _WEIGHTS = np.array([0.0, 1.0, -1.0]) * 2 / np.sqrt(3), np.array([2.0, 3.0, 3.0]) / 8
+# Three sigma points of an uncertain heading, in standard deviations, and their weights: those of an
+# unknown heading are a third of a turn from each other.
+_SIGMA_POINTS, _WEIGHTS = np.array([0.0, 1.0, -1.0]) * 2 / np.sqrt(3), np.array([2.0, 3.0, 3.0]) / 8
 
 
 def turned_back(spectra: Spectrum, yaw: Array, sign: float) -> Vectors:
-    """Spectra (T, H, J), seen at headings yaw (T,) rad, as they would be at heading 0.
-
-    As real vectors (T, (2 H - 1) J); `sign` is -1 where columns grow clockwise.
-    """
+    """Real vectors (T, (2 H - 1) J) of spectra (T, H, J) at headings yaw (T,) rad, turned to
+    heading 0; `sign` is -1 where columns grow clockwise."""
     phase = -1j * sign * np.outer(yaw, np.arange(spectra.shape[1]))
     at_zero = spectra * np.exp(phase).astype(np.complex64)[:, :, None]
     parts = [at_zero.real, at_zero.imag[:, 1:]]
@@ -59,10 +56,7 @@ class TurnedMaps:
 
     @classmethod
     def fit(cls, spectra: Spectrum, yaw: Array, sign: float) -> TurnedMaps:
-        """Of spectra (T, H, J) at headings yaw (T,) rad; at most DIMENSIONS components.
-
-        Raises DataError where all are equal.
-        """
+        """Of spectra (T, H, J) at headings yaw (T,) rad. Raises DataError where all are equal."""
         from scipy import linalg  # for training alone
 
         vectors = turned_back(spectra, yaw, sign)
@@ -84,15 +78,14 @@ class TurnedMaps:
     def predict(
         self, metric: MetricMap, spectra: Spectrum, yaw: Array, yaw_variance: Array
     ) -> tuple[Array, Array, Array]:
-        """Positions (T, 2) m by a map of the components, their covariances (T, 2, 2) by the map,
-        and what uncertain headings, yaw (T,) rad with variances (T,), add to these.
-        """
-        yaws = yaw + np.outer(_APART, np.sqrt(yaw_variance))
+        """Positions (T, 2) m by a map of the components at headings yaw (T,) rad with variances
+        (T,), their covariances (T, 2, 2) by the map, and those by the headings."""
+        yaws = yaw + np.outer(_SIGMA_POINTS, np.sqrt(yaw_variance))
         features = self.features(np.tile(spectra, (len(yaws), 1, 1)), yaws.ravel())
         places, covariances = metric.predict(features)
         places, covariances = (a.reshape(len(yaws), len(yaw), 2, -1) for a in (places, covariances))
-        apart = places - places[0]
-        by_yaw = np.tensordot(_WEIGHTS, apart @ apart.swapaxes(-1, -2), 1)
+        moved = places - places[0]
+        by_yaw = np.tensordot(_WEIGHTS, moved @ moved.swapaxes(-1, -2), 1)
         return places[0, :, :, 0], np.tensordot(_WEIGHTS, covariances, 1), by_yaw
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:

@@ -102,7 +102,7 @@ def _correlation(result: MetricResult, segments: Segments) -> ErrorCorrelation:
     """The correlation of errors of left-out images along straight lines."""
     stack = Stack.of(segments)
     way_m = np.cumsum(stack.steps)
-    return ErrorCorrelation.fit(result.left_out, result.left_out_variance, way_m, stack.owner)
+    return ErrorCorrelation.fit(result.held_out, result.held_out_variance, way_m, stack.owner)
 
 
 def flat(places: Array) -> Array:
