@@ -116,7 +116,7 @@ def contradicted(
     sentences on that.
     """
     stamps, step = odometry.stamps_ns, relative(odometry.poses[:-1], odometry.poses[1:])
-    seconds, length = summed(np.diff(stamps) * 1e-9), np.hypot(step[:, 0], step[:, 1])
+    seconds, length = (stamps - stamps[0]) * 1e-9, np.hypot(step[:, 0], step[:, 1])
     moved = length + np.abs(step[:, 2])
     still_s = np.where(moved < STANDING * np.diff(seconds), np.diff(seconds), 0.0)
     inside = (stamps_ns >= stamps[0]) & (stamps_ns <= stamps[-1])
