@@ -14,7 +14,7 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.run import Odometry, integrate
 from sfa_localization.keyframes.closures import Closures
-from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack, TurnCorrection, Way
+from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack, Way
 from sfa_localization.metric.odometry_errors import (
     CLOSURES_MIN,
     LARGEST_LOSS,
@@ -64,11 +64,11 @@ def drives(yaw_noise: float) -> list[Drive]:
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 def test_images_that_turn_better_correct_the_odometry(sign):
     runs = drives(0.04)
-    turns = corrections(headings_of(runs, 0.004, sign), closures_of(runs, 200))
-    for run, correction in zip(runs, turns, strict=True):
-        assert 0.002 < correction.noise < 0.006
+    yaws, noise = corrections(headings_of(runs, 0.004, sign), closures_of(runs, 200))
+    assert 0.002 < noise < 0.006
+    for run, yaw in zip(runs, yaws, strict=True):
         before = OdometryTrack.of(run.odometry, CONFIG)
-        after = before.corrected(correction)
+        after = before.corrected(run.stamps_ns, yaw, noise)
         at = np.searchsorted(after.stamps_ns, run.stamps_ns)
         before_error, after_error = (
             (
@@ -96,7 +96,7 @@ def test_a_few_wrong_closures_change_little():
     closures = closures_of(runs, 200)
     wrong = closures.turn + 1.5 * (np.arange(400) % 10 == 0)
     first, second = (
-        corrections(headings_of(runs, 0.004), dataclasses.replace(closures, turn=turn))[0].yaw
+        corrections(headings_of(runs, 0.004), dataclasses.replace(closures, turn=turn))[0][0]
         for turn in (closures.turn, wrong)
     )
     np.testing.assert_allclose(second, first, atol=0.02 * np.ptp(first))
@@ -107,8 +107,8 @@ def test_segments_have_the_corrected_turns_and_their_noise():
     yaw = np.unwrap(run.poses[:, 2])
     track = OdometryTrack.of(run.odometry, CONFIG)
     at = np.searchsorted(track.stamps_ns, run.stamps_ns)
-    exact = TurnCorrection(run.stamps_ns, yaw - track.yaw[at], 0.002)
-    segments = cut_track(track.corrected(exact), run.stamps_ns, CONFIG)
+    exact = track.corrected(run.stamps_ns, yaw - track.yaw[at], 0.002)
+    segments = cut_track(exact, run.stamps_ns, CONFIG)
     for a, b in itertools.pairwise(segments.items):
         assert abs(wrap_angle(a.turn_rad - (yaw[b.images[0]] - yaw[a.images[0]]))) < 1e-6
         assert a.turn_variance >= 0.002**2 * a.turn_time_s * 0.99
@@ -116,11 +116,9 @@ def test_segments_have_the_corrected_turns_and_their_noise():
 
 def test_segments_of_corrected_turns_are_longer_and_their_links_stronger():
     run, _ = drives(0.0)
-    nothing = TurnCorrection(run.stamps_ns, np.zeros(len(run.stamps_ns)), CONFIG.yaw_noise)
     track = OdometryTrack.of(run.odometry, CONFIG)
-    before, after = (
-        cut_track(each, run.stamps_ns, CONFIG) for each in (track, track.corrected(nothing))
-    )
+    same = track.corrected(run.stamps_ns, 0.0 * run.stamps_ns, CONFIG.yaw_noise)
+    before, after = (cut_track(each, run.stamps_ns, CONFIG) for each in (track, same))
     weak, strong = (
         np.median([s.displacement_variance / s.turn_time_s for s in part if s.linked])
         for part in (before, after)

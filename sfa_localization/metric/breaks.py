@@ -64,14 +64,12 @@ def _jumps(odometry: Odometry) -> tuple[Mask, Array, float]:
         means = [each[:, :3] / np.maximum(each[:, 3:], period) for each in (before, after)]
         usual = (before + after)[:, :3] / np.maximum((before + after)[:, 3:], period) * dt[:, None]
         noise = MEDIAN_TO_STD * float(np.median(np.abs(step - usual)[:, :2].max(1)))
-        distance = np.full((2, len(step)), np.inf)
-        for speed in (*means, single[:-2], single[2:]):
-            rest = step - speed * shortest_s[:, None]
-            for k, axes in enumerate((slice(0, 2), slice(2, 3))):
-                distance[k] = np.minimum(
-                    distance[k], beyond(rest[:, axes], more_s, [speed[:, axes]])
-                )
-        jump = distance.max(axis=0) > tolerance(np.maximum(dt, period), noise)
+        rest = [(step - v * shortest_s[:, None], v) for v in (*means, single[:-2], single[2:])]
+        distance = [
+            np.min([beyond(r[:, axes], more_s, [v[:, axes]]) for r, v in rest], axis=0)
+            for axes in (slice(0, 2), slice(2, 3))
+        ]
+        jump = np.max(distance, axis=0) > tolerance(np.maximum(dt, period), noise)
     return jump, usual, noise
 
 

@@ -30,17 +30,6 @@ SEEN_TURN_SLIDE = 0.01
 With more, the links are so weak that maps shrink by 4 %."""
 
 
-@dataclass(frozen=True, slots=True)
-class TurnCorrection:
-    """What to add to the yaw of a track: `yaw` (N,) rad at stamps (N,), linear between them, and
-    the `noise` of the resulting turns, rad per square root of s.
-    """
-
-    stamps_ns: Stamps
-    yaw: Array
-    noise: float
-
-
 class Way(NamedTuple):
     """The way of a drive, from the way that its wheels counted: `scale` times it, less a `loss`
     (m per radian) in turns, of standard deviation `loss_std`.
@@ -124,12 +113,13 @@ class OdometryTrack:
         """Turned in either direction since the start (N,), rad."""
         return summed(np.abs(np.diff(self.yaw)))
 
-    def corrected(self, turns: TurnCorrection) -> OdometryTrack:
-        """The same wheel steps with corrected turns."""
-        at = (turns.stamps_ns - self.stamps_ns[0]) * 1e-9
-        track = self._turned(self.yaw + np.interp(self.seconds, at, turns.yaw))
-        variance = turns.noise**2 * self.seconds
-        return replace(track, yaw_variance=variance, slide=SEEN_TURN_SLIDE)
+    def corrected(self, stamps_ns: Stamps, yaw: Array, noise: float) -> OdometryTrack:
+        """The same wheel steps, with `yaw` (M,) rad added at stamps (M,), linear between them; the
+        turns then have this noise, rad per square root of s.
+        """
+        at = (stamps_ns - self.stamps_ns[0]) * 1e-9
+        track = self._turned(self.yaw + np.interp(self.seconds, at, yaw))
+        return replace(track, yaw_variance=noise**2 * self.seconds, slide=SEEN_TURN_SLIDE)
 
     def driven(self, way: Way) -> OdometryTrack:
         """The same turns with the corrected way."""

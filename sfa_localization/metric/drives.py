@@ -87,10 +87,12 @@ class Drives:
         """Dead reckoning of each drive, with the turns of its images where these are better."""
         runs = [drive.run for drive in self.items]
         tracks = [OdometryTrack.of(run.odometry, self.config, run.yaw_rate) for run in runs]
-        turns = corrections(self._headings(tracks), self.closures)
-        if turns is None:
+        better = corrections(self._headings(tracks), self.closures)
+        if better is None:
             return tracks
-        return [track.corrected(turn) for track, turn in zip(tracks, turns, strict=True)]
+        yaws, noise = better
+        changes = zip(tracks, self.items, yaws, strict=True)
+        return [track.corrected(drive.stamps_ns, yaw, noise) for track, drive, yaw in changes]
 
     def _headings(self, tracks: Sequence[OdometryTrack]) -> list[Headings]:
         pairs = zip(tracks, self.items, strict=True)

@@ -61,6 +61,11 @@ _IMAGES_REMEDIES = {
     'scale': 'a panorama shows all around once, so that a full turn shifts it by its width; or is '
     'the track of the wheels too wide?',
 }
+_WAY_REMEDIES = {
+    'alike': 'is the heading of the pose right?',
+    'sign': 'correct the sign of twist.linear.x, or the heading of the pose',
+    'scale': 'publish m and m/s',
+}
 
 
 @dataclass
@@ -145,10 +150,10 @@ def check_motion(
     turns = check.pair(POSE, IMAGES)
     if images is not None and not panoramas and turns and turns.scale < 0:
         return check_motion(odometry, (images[0], -images[1]), gyro, panoramas, views)
-    _judge_way(check)
+    _judge(check, 'way')
     if not impossible:
         _judge_axes(check)
-        _judge_turns(check)
+        _judge(check, 'turns')
         _judge_clocks(check)
         if views is not None:
             late_ns = round(turns.late_s * 1e9) if turns else 0
@@ -226,27 +231,9 @@ def _judge_axes(check: MotionCheck) -> None:
         (check.wrong if sideways > 2 * SIDEWAYS * ahead else check.notes).append(text)
 
 
-def _judge_way(check: MotionCheck) -> None:
-    """The ways of pose and twist."""
-    pair = check.pair(POSE, TWIST, 'way')
-    if pair is None:
-        return
-    if pair.differs('alike'):
-        check.notes.append(f'{TWIST} does not drive with {POSE}: is the heading of the pose right?')
-    elif pair.differs('sign'):
-        check.wrong.append(
-            f'{TWIST} drives backwards where {POSE} drives ahead: correct the sign of '
-            'twist.linear.x, or the heading of the pose'
-        )
-    elif pair.differs('scale'):
-        text = f'{TWIST} drives {pair.scale:.3g} times as far as {POSE}{unit(pair)}'
-        skids = 1 / SKIDDING < pair.scale < SKIDDING
-        (check.notes if skids else check.wrong).append(f'{text}: publish m and m/s')
-
-
-def _judge_turns(check: MotionCheck) -> None:
-    """Report the minority for each kind of difference."""
-    pairs = [pair for pair in check.pairs if pair.what == 'turns']
+def _judge(check: MotionCheck, what: str) -> None:
+    """Report the minority for each kind of difference of the turns, or of the way."""
+    pairs = [pair for pair in check.pairs if pair.what == what]
     names = {name for pair in pairs for name in (pair.a, pair.b)}
     for kind in ('alike', 'sign', 'scale'):
         groups = _groups(pairs, kind, names)
@@ -279,7 +266,8 @@ def _report(check: MotionCheck, kind: str, group: set[str], others: set[str], pa
         'sign': 'opposite to',
         'scale': f'{factor:.3g} times as far{unit(pair)} as',
     }[kind]
-    text = f'{_listed(group)} {"turn" if group == {IMAGES} else "turns"} {how} {_listed(others)}'
+    verb = 'drives' if pair.what == 'way' else 'turn' if group == {IMAGES} else 'turns'
+    text = f'{_listed(group)} {verb} {how} {_listed(others)}'
     drastic = kind == 'sign' or (kind == 'scale' and not 1 / SKIDDING < factor < SKIDDING)
     if GYRO in group:
         _correct_gyro(check, kind, text, factor)
@@ -291,6 +279,8 @@ def _report(check: MotionCheck, kind: str, group: set[str], others: set[str], pa
         # Skidding wheels turn farther than the robot does.
         images_err = factor > 1 or _devices(others) > 1
         wrong = {'alike': pair.independent, 'sign': True, 'scale': images_err}[kind]
+    elif pair.what == 'way':
+        remedy, wrong = _WAY_REMEDIES[kind], drastic
     elif group >= {POSE, TWIST}:
         remedy = 'swap left and right wheel' if kind == 'sign' else 'do the wheels skid?'
         wrong = drastic

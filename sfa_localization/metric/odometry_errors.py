@@ -25,13 +25,7 @@ from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_a
 from sfa_localization.data.run import Run, Stamps
 from sfa_localization.data.statistics import MEDIAN_TO_STD, evenly, outlier_factor
 from sfa_localization.keyframes.closures import Closures, driven
-from sfa_localization.metric.dead_reckoning import (
-    OdometryTrack,
-    TurnCorrection,
-    Way,
-    spaced,
-    summed,
-)
+from sfa_localization.metric.dead_reckoning import OdometryTrack, Way, spaced, summed
 
 CLOSURES_MIN = 30
 """Fewer closures show by chance that images turn better."""
@@ -65,7 +59,6 @@ class Headings:
     the sum of the shifts between `images`, whose sign may be either.
     """
 
-    stamps_ns: Stamps
     time_s: Array
     track: Array
     images: Array
@@ -77,11 +70,12 @@ class Headings:
         time_s = (stamps_ns - track.stamps_ns[0]) * 1e-9
         yaw = np.interp(time_s, track.seconds, track.yaw)
         part = track.part[np.searchsorted(track.stamps_ns[1:], stamps_ns, 'right')]
-        return cls(stamps_ns, time_s, yaw, np.unwrap(np.asarray(images, float)), part)
+        return cls(time_s, yaw, np.unwrap(np.asarray(images, float)), part)
 
 
-def corrections(drives: Sequence[Headings], closures: Closures) -> list[TurnCorrection] | None:
-    """Of each drive; None where the closures do not show that its images turn better.
+def corrections(drives: Sequence[Headings], closures: Closures) -> tuple[list[Array], float] | None:
+    """What to add to the yaw (N,) rad of each drive at its images, and the noise of the turns then,
+    rad per square root of s; None if the closures do not show that images turn better.
 
     The closures number the images of all drives one after the other.
     """
@@ -94,14 +88,10 @@ def corrections(drives: Sequence[Headings], closures: Closures) -> list[TurnCorr
     if BETTER * images > odometry:
         return None
     total = odometry**2 + images**2
+    # Headings differ by whole turns, and between neighboring images by less than half of one.
+    differences = [np.unwrap(sign * drive.images - drive.track) for drive in drives]
     share, noise = odometry**2 / total, odometry * images / np.sqrt(total)
-    turns = []
-    for drive in drives:
-        # Shifts are known to whole turns: between neighboring images both differ by less than half.
-        difference = np.unwrap(sign * drive.images - drive.track)
-        yaw = share * (difference - difference[0])
-        turns.append(TurnCorrection(drive.stamps_ns, yaw, noise))
-    return turns
+    return [share * (each - each[0]) for each in differences], float(noise)
 
 
 def _residuals(drives: Sequence[Headings], closures: Closures) -> tuple[Array, Array]:
