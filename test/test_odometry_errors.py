@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres, place, recipe, run_in, wander
-from metric_worlds import Drive, drive, meander
+from metric_worlds import drive, meander
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import align, wrap_angle
@@ -32,7 +32,7 @@ from sfa_localization.training_input import TrainingInput
 CONFIG = SegmentConfig()
 
 
-def headings_of(runs: list[Drive], noise: float, sign: float = 1.0) -> list[Headings]:
+def headings_of(runs, noise: float, sign: float = 1.0) -> list[Headings]:
     """Of images whose shifts have this white noise, rad per square root of s."""
     headings = []
     for seed, run in enumerate(runs):
@@ -44,7 +44,7 @@ def headings_of(runs: list[Drive], noise: float, sign: float = 1.0) -> list[Head
     return headings
 
 
-def closures_of(runs: list[Drive], count: int) -> Closures:
+def closures_of(runs, count: int) -> Closures:
     """Pairs of images of each run with their true turns."""
     rng, start, pairs, turns = np.random.default_rng(0), 0, [], []
     for run in runs:
@@ -55,7 +55,7 @@ def closures_of(runs: list[Drive], count: int) -> Closures:
     return Closures(np.concatenate(pairs), np.concatenate(turns))
 
 
-def drives(yaw_noise: float) -> list[Drive]:
+def drives(yaw_noise: float):
     """Two drives of 200 s whose odometry turns with this white noise, rad per square root of s."""
     per_step = yaw_noise * np.sqrt(50.0)
     return [drive(meander(200.0, seed=k)[0], yaw_noise=per_step, seed=k) for k in (3, 4)]
