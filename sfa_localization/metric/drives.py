@@ -212,9 +212,9 @@ def learn_map(
         except DataError as error:
             logger.warning('the way that wheels lose in turns stays in the map: %s', error)
             break
-    if result.diagnostics.one_route and strict:
+    if result.diagnostics.single_route and strict:
         raise DataError(f'{ROUTE}, or train without --strict')
-    if result.diagnostics.one_route:
+    if result.diagnostics.single_route:
         logger.warning(ROUTE)
     return segments, result
 

@@ -143,7 +143,7 @@ def learn_metric(
     left = leave_out(fit)
     overfits = left.explained < LITTLE and left.variance > OVERFIT * fit.variance
     searched = config.solver == 'certified' and problem.graph is None
-    if overfits and searched and not diagnose(fit).one_route:
+    if overfits and searched and not diagnose(fit).single_route:
         fit = choose(replace(problem, graph=Graph.of(segments)), scale)
         left = leave_out(fit)
     if fit.problem.graph is not None:

@@ -129,7 +129,7 @@ def advice(trained: Trained, places: Array) -> list[str]:
     lines = [
         f'Cross x {x:.1f} m, y {y:.1f} m, in two directions.' for x, y, _ in weak_places(forecast)
     ]
-    if not found.one_route:
+    if not found.single_route:
         lines += lanes_apart(places, InspectionConfig().reach)
     if found.directions < PARALLEL:
         lines.append('Drive in other directions: most of this drive was parallel.')
