@@ -22,7 +22,7 @@ from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
 from sfa_localization.keyframes.closures import LIKE
 from sfa_localization.metric.dead_reckoning import pauses, spaced, summed
 
-Textures = tuple[Stamps, NDArray[np.int8]]
+StampedTextures = tuple[Stamps, NDArray[np.int8]]
 """Stamps (N,) of images, and small versions of these (N, rows, columns), of zero mean around the
 robot."""
 STEP = 0.2

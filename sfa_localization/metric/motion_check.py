@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
-from sfa_localization.data.geometry import Array, Complex, relative, wrap_angle
+from sfa_localization.data.geometry import Array, Complex, Indices, relative, wrap_angle
 from sfa_localization.data.odometry_steps import JUMP, NOISE
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
-from sfa_localization.metric.breaks import Textures, contradicted, parted
+from sfa_localization.metric.breaks import StampedTextures, contradicted, parted
 from sfa_localization.metric.motion_sources import (
     ENOUGH,
     EQUAL,
@@ -132,7 +132,7 @@ def check_motion(
     images: tuple[Stamps, Array] | None = None,
     gyro: YawRate | None = None,
     panoramas: bool = True,
-    views: Textures | None = None,
+    views: StampedTextures | None = None,
 ) -> MotionCheck:
     """Compare all sources of a drive: see `sources_of`, and `contradicted` for the `views`.
 
@@ -168,17 +168,21 @@ def check_motion(
 
 
 def _impossible(sources: Sequence[Source]) -> Iterator[str]:
-    """Stamps in other units, and speeds that no robot reaches."""
+    """Stamps in other units, and speeds that no robot reaches in a tenth of its seconds."""
     for source in sources:
-        problem = _stamp_problem(source.stamps_ns)
+        problem, at = _stamp_problem(source.stamps_ns), _seconds(source.stamps_ns)
         if problem and source.name != TWIST:
             yield f'{source.name}: {problem}'
-        elif not problem and 'way' in source.sums:
-            # The 90th percentile of the mean speeds of whole seconds, m/s.
-            seconds = (source.stamps_ns - source.stamps_ns[0]) * 1e-9
-            way = np.interp(np.arange(seconds[-1] + 1), seconds, source.sums['way'])
-            if (speed := np.percentile(np.abs(np.diff(way)), 90)) > FASTEST_MPS:
+        elif not problem and 'way' in source.sums and len(at) > 1:
+            time_s = np.maximum(np.diff(source.stamps_ns[at]) * 1e-9, 0.1)
+            speed = np.percentile(np.abs(np.diff(source.sums['way'][at])) / time_s, 90)
+            if speed > FASTEST_MPS:
                 yield f'{source.name} drives at {speed:.3g} m/s: publish meters, not millimeters'
+
+
+def _seconds(stamps_ns: Stamps) -> Indices:
+    """The first row of each second of stamps (N,)."""
+    return np.flatnonzero(np.diff((stamps_ns - stamps_ns[0]) // 1_000_000_000, prepend=-1))
 
 
 def _stamp_problem(stamps_ns: Stamps) -> str:
@@ -195,9 +199,8 @@ def _ahead(odometry: Odometry) -> Complex:
     """The way of each second, m, along (real) and to the left of its mean heading. Seconds with
     much turn are left out: their chord does not show the heading.
     """
-    stamps, poses = odometry.stamps_ns, odometry.poses
-    at = np.flatnonzero(np.diff((stamps - stamps[0]) // 1_000_000_000, prepend=-1))
-    step = relative(poses[at[:-1]], poses[at[1:]])
+    at = _seconds(odometry.stamps_ns)
+    step = relative(odometry.poses[at[:-1]], odometry.poses[at[1:]])
     chord = (step[:, 0] + 1j * step[:, 1]) * np.exp(-0.5j * step[:, 2])
     whole = odometry.part[at[:-1]] == odometry.part[at[1:]]
     return np.asarray(chord[whole & (np.abs(chord) > JUMP) & (np.abs(step[:, 2]) < SLIGHT_TURN)])
