@@ -174,14 +174,14 @@ class Drives:
 def rig_of(drives: Drives, segments: Segments) -> Rig:
     """What was learned of the robot."""
     usual, delays = Rig(), [d.delay_ns * 1e-9 for d in drives.items if d.delay_ns is not None]
-    ways = np.array([way or Way(loss_std=usual.turn_loss.std) for way in segments.ways])
+    ways = [way or Way(loss_std=usual.turn_loss.std) for way in segments.ways]
+    losses, loss_std = [way.loss for way in ways], max(way.loss_std for way in ways)
     scale_std = segments.anchors.settled.scale_std if segments.anchors else SCALE_STD
-    scale, loss, _ = ways.mean(axis=0).tolist()
     return Rig(
         **segments.mount.quantities,
         camera_delay=usual.camera_delay._replace(value=float(np.median(delays or [0.0]))),
-        wheel_scale=Quantity(scale, scale_std),
-        turn_loss=Quantity(loss, math.hypot(float(ways[:, 1].std()), float(ways[:, 2].max()))),
+        wheel_scale=Quantity(float(np.mean([way.scale for way in ways])), scale_std),
+        turn_loss=Quantity(float(np.mean(losses)), math.hypot(float(np.std(losses)), loss_std)),
     )
 
 
