@@ -1,16 +1,15 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of the odometry that images show: its turns, and the way that its wheels lose in them.
+"""Errors of the odometry that images show: its turns, and the way that wheels lose in turns.
 
-Wheels that slip err in turns by tens of degrees a minute, the sums of shifts between images by one,
-or by more than any wheel among trees near and far. A loop closure measures the turn since the robot
-was at the place before. So the residuals of both at the closures are their noise, and the weights
-of their mean.
+Turns by slipping wheels err by tens of degrees a minute; the sums of shifts between images by one
+degree, but by more than wheels among trees near and far. A loop closure measures the turn since the
+robot was at the place before: its residuals give the noise of both, and the weights of their mean.
 
 Wheels count more way in a turn than the robot drives: they slide, and controllers slow down. Four
-small robots lost 0.07 to 0.1 m per radian, half of the error of their odometry. Images of a map, in
-which this averages out where tracks cross, move by scale D - loss L between images some decimeters
-apart, with the odometry's displacement D turned into the map, and what one m/rad takes from it, L.
+small robots lost 0.07 to 0.1 m per radian, half of the error of their odometry. In a map this
+averages out where tracks cross. Over some decimeters its images move by scale D - loss L, where D
+is the odometry's displacement in the frame of the map, and L its change by a loss of 1 m/rad.
 """
 
 from __future__ import annotations
@@ -44,8 +43,9 @@ show a loss in turns."""
 PAIRS_MIN = 50
 """Fewer pairs of images are no evidence."""
 REACH_M, UNEQUAL = (3.0, 50.0), 0.02
-"""Least distance of two places that two drives have passed, many times the error of closures, and
-longest way between them; two pairs of equal wheels differ by less than the third."""
+"""The scale of two drives is compared between places that are farther apart than the first, many
+times the error of closures, with less way between them; that of equal wheels differs by less than
+the third."""
 # Closures of two drives that are paired, and rounds of reweighting until the fit settles.
 _PAIRED, _ROUNDS = 400, 10
 
