@@ -276,7 +276,7 @@ def test_lanes_that_nothing_crosses_are_one_route():
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     features = exact_features(run.poses - [3.0, 3.0, 0.0])
     found = learn_metric(features, segments, EXACT)
-    assert found.diagnostics.one_route and found.diagnostics.crossings == 0
+    assert found.diagnostics.single_route and found.diagnostics.crossings == 0
     assert errors(found.map.predict(features)[0], in_odometry_frame(run)[:, :2]).max() < 1e-6
 
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Segments: both cutters against drives whose every pose is known."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,35 +17,37 @@ from sfa_localization.metric.settings import SegmentConfig
 
 ANY = SegmentConfig()
 STRAIGHT = SegmentConfig(segments='straight')
-SQUARE = np.vstack([np.vstack([straight(5.0), turn(np.pi / 2)]) for _ in range(4)])
+SQUARE = np.vstack([straight(5.0), turn(np.pi / 2)] * 4)
 
 
 def length_m(segment):
     return np.abs(np.diff(segment.path)).sum()
 
 
-def frame(segment, poses):
-    """True pose of the segment's frame."""
-    first = poses[segment.images[0]].copy()
-    first[2] -= segment.headings[0]
-    return first
+def picked(odometry, keep):
+    names = ('stamps_ns', 'poses', 'twists', 'variances')
+    return Odometry(*(getattr(odometry, name)[keep] for name in names))
 
 
 def check_segments(segments, poses, tolerance=1e-6):
     """Paths, headings, turns and displacements against the truth."""
+
+    def frame(segment):
+        return poses[segment.images[0]] - [0.0, 0.0, segment.headings[0]]
+
     for segment in segments:
-        local = relative(frame(segment, poses), poses[segment.images])
+        local = relative(frame(segment), poses[segment.images])
         assert np.allclose(segment.path, local[:, 0] + 1j * local[:, 1], atol=tolerance)
         assert np.allclose(wrap_angle(segment.headings - local[:, 2]), 0, atol=tolerance)
     for a, b in zip(segments.items[:-1], segments.items[1:], strict=True):
-        step = relative(frame(a, poses), frame(b, poses))
+        step = relative(frame(a), frame(b))
         assert abs(wrap_angle(a.turn_rad - step[2])) < tolerance
         assert abs(a.displacement - (step[0] + 1j * step[1])) < tolerance
 
 
 def test_a_square_gives_its_four_sides():
     run = drive(SQUARE)
-    silent = dataclasses.replace(run.odometry, twists=np.zeros_like(run.odometry.twists))
+    silent = replace(run.odometry, twists=np.zeros_like(run.odometry.twists))
     for odometry in (run.odometry, silent):
         segments = cut(odometry, run.stamps_ns, STRAIGHT)
         assert [round(length_m(s), 1) for s in segments] == pytest.approx([4.8] * 4, abs=0.25)
@@ -55,11 +57,6 @@ def test_a_square_gives_its_four_sides():
         check_segments(segments, run.poses)
 
 
-def drive_of(*parts):
-    run = drive(np.vstack(parts))
-    return run.odometry, run.stamps_ns
-
-
 def test_pieces_of_a_curved_drive_follow_the_truth():
     twists, start = meander(60.0, seed=3)
     run = drive(twists, start=start)
@@ -67,25 +64,27 @@ def test_pieces_of_a_curved_drive_follow_the_truth():
     assert all(length_m(s) <= PIECE_LENGTH_M + 1e-6 for s in segments)
     assert segments.images.used == len(run.stamps_ns)
     check_segments(segments, run.poses)
-    slow = picked(run.odometry, np.arange(len(run.odometry.stamps_ns)) % 30 == 0)
+    slow = picked(run.odometry, slice(None, None, 30))
     segments = cut(slow, run.stamps_ns, ANY)
     assert 'pauses' not in segments.odometry.skipped, 'not at each message'
     assert segments.images.used > 0.8 * len(run.stamps_ns)
 
 
-def test_every_picture_is_used_once_or_counted():
+@pytest.mark.parametrize('config', [ANY, STRAIGHT])
+def test_every_picture_is_used_once_or_counted(config):
     twists, start = criss_cross(6)
     run = drive(np.vstack([twists, stand(5.0)]), start=start)
-    for config in (ANY, STRAIGHT):
-        segments = cut(run.odometry, run.stamps_ns, config)
-        images = np.concatenate([s.images for s in segments])
-        assert len(np.unique(images)) == len(images) == segments.images.used
-        assert segments.images.used + sum(segments.images.skipped.values()) == len(run.stamps_ns)
+    stamps = np.concatenate([[0], run.stamps_ns, [10**12, 2 * 10**12]])
+    segments = cut(run.odometry, stamps, config)
+    images = np.concatenate([s.images for s in segments])
+    assert len(np.unique(images)) == len(images) == segments.images.used
+    assert segments.images.used + sum(segments.images.skipped.values()) == len(stamps)
+    assert segments.images.skipped['without odometry'] == 3
 
 
-def test_standing_still_is_left_out_and_does_not_break_the_line():
-    odometry, stamps = drive_of(straight(4.0), stand(4.0), straight(4.0))
-    segments = cut(odometry, stamps, ANY)
+def test_images_of_a_standing_robot_are_skipped_and_do_not_break_the_line():
+    run = drive(np.vstack([straight(4.0), stand(4.0), straight(4.0)]))
+    segments = cut(run.odometry, run.stamps_ns, ANY)
     assert segments.images.skipped['standing still'] == pytest.approx(20, abs=2)
     assert sum(length_m(s) for s in segments) > 7.0
     assert all(s.linked for s in segments.items[:-1])
@@ -93,40 +92,37 @@ def test_standing_still_is_left_out_and_does_not_break_the_line():
 
 def test_a_pause_of_the_odometry_breaks_the_drive_and_its_pictures_are_counted():
     run = drive(straight(12.0))
-    keep = np.ones(len(run.odometry.stamps_ns), bool)
-    keep[250:350] = False
-    segments = cut(picked(run.odometry, keep), run.stamps_ns, ANY)
+    rows = np.arange(len(run.odometry.stamps_ns))
+    segments = cut(picked(run.odometry, (rows < 250) | (rows >= 350)), run.stamps_ns, ANY)
     assert segments.odometry.skipped == {'pauses': 1}
     assert segments.images.skipped['in a break of odometry'] == pytest.approx(10, abs=1)
     assert sum(not s.linked for s in segments) == 2
 
 
-def picked(odometry, keep):
-    names = ('stamps_ns', 'poses', 'twists', 'variances')
-    return Odometry(*(getattr(odometry, name)[keep] for name in names))
-
-
-def test_pictures_outside_the_odometry_are_left_out_and_counted():
-    run = drive(straight(8.0))
-    outside = np.concatenate([[0], run.stamps_ns, [10**12, 2 * 10**12]])
-    segments = cut(run.odometry, outside, ANY)
-    assert segments.images.skipped == {'without odometry': 3}
-    assert segments[0].images[0] == 1
-
-
 def test_the_gyro_replaces_the_wheels_yaw():
-    run = drive(meander(40.0)[0], start=(0.0, 0.0, 0.0))
-    biased = drive(meander(40.0)[0], bias=0.02)
+    run, biased = drive(meander(40.0)[0]), drive(meander(40.0)[0], bias=0.02)
     segments = cut(biased.odometry, biased.stamps_ns, ANY, run.gyro)
     check_segments(segments, run.poses, tolerance=1e-2)
-    wheels = dataclasses.replace(ANY, yaw_source='odometry')
-    ignored = cut(biased.odometry, biased.stamps_ns, wheels, run.gyro)
-    assert abs(ignored[0].turn_rad - segments[0].turn_rad) > 0.02
+    wheels = cut(biased.odometry, biased.stamps_ns, replace(ANY, yaw_source='odometry'), run.gyro)
+    assert abs(wheels[0].turn_rad - segments[0].turn_rad) > 0.02
     with pytest.raises(DataError, match='imu topic'):
-        cut(run.odometry, run.stamps_ns, dataclasses.replace(ANY, yaw_source='gyro'))
+        cut(run.odometry, run.stamps_ns, replace(ANY, yaw_source='gyro'))
 
 
-def test_what_a_yaw_rate_bias_does_is_known_to_first_order():
+@pytest.mark.parametrize('gap', [(2.0, 10.0), (15.0, 1e9)])
+def test_where_the_gyro_pauses_the_wheels_go_on(gap):
+    run, bias = drive(np.vstack([SQUARE, SQUARE])), 0.02
+    seconds = (run.gyro.stamps_ns - run.gyro.stamps_ns[0]) * 1e-9
+    keep = (seconds < gap[0]) | (seconds > gap[1])
+    columns = run.gyro.stamps_ns, run.gyro.omega + bias, run.gyro.variance
+    gyro = YawRate(*(column[keep] for column in columns))
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT, gyro)
+    assert segments.odometry.skipped['in a gap of the gyroscope'] > 0
+    turns = [s.turn_rad - bias * s.turn_time_s for s in segments.items[:-1]]
+    assert turns == pytest.approx([np.pi / 2] * 7, abs=0.01)
+
+
+def test_drift_is_the_derivative_by_a_yaw_rate_bias():
     twists, start = meander(40.0, seed=2)
     clean, bias = drive(twists, start=start), 1e-3
     biased = drive(twists, start=start, bias=bias)
@@ -141,19 +137,19 @@ def test_what_a_yaw_rate_bias_does_is_known_to_first_order():
 def test_message_variances_rule_over_the_configured_noise(monkeypatch):
     monkeypatch.setattr(segments_module, 'PIECE_STD_M', 10.0)
     run = drive(straight(12.0))
-    told = dataclasses.replace(run.odometry, variances=np.full((601, 2), 4.0))
-    ours = cut(run.odometry, run.stamps_ns, ANY)[0].turn_variance
-    theirs = cut(told, run.stamps_ns, ANY)[0].turn_variance
-    # 4 rad^2/s^2 per message of 0.02 s: 4 * 0.02^2 rad^2 each, over the messages between.
-    between = 3.0 * 50
-    assert theirs == pytest.approx(4.0 * 0.02**2 * between, rel=0.1)
-    assert ours < theirs / 100
+    stated = replace(run.odometry, variances=np.full((601, 2), 4.0))
+    configured, by_messages = (
+        cut(odometry, run.stamps_ns, ANY)[0].turn_variance for odometry in (run.odometry, stated)
+    )
+    # 4 rad^2/s^2 per message of 0.02 s: 4 * 0.02^2 rad^2 each, over 3 s of messages.
+    assert by_messages == pytest.approx(4.0 * 0.02**2 * 3.0 * 50, rel=0.1)
+    assert configured < by_messages / 100
 
 
 def test_links_err_as_they_say(monkeypatch):
     """Straight ahead, with noise of the yaw rate alone."""
     monkeypatch.setattr(segments_module, 'PIECE_STD_M', 10.0)
-    config, squared = dataclasses.replace(ANY, yaw_noise=0.05), []
+    config, squared = replace(ANY, yaw_noise=0.05), []
     for seed in range(20):
         run = drive(straight(30.0), yaw_noise=0.05 * np.sqrt(50), seed=seed)
         squared += [
@@ -164,55 +160,40 @@ def test_links_err_as_they_say(monkeypatch):
     assert np.mean(squared, axis=0) == pytest.approx([1.0, 1.0], abs=0.25)
 
 
-def test_joined_runs_keep_their_pictures_apart():
+def test_joined_runs_have_separate_images_and_no_link():
     run = drive(SQUARE)
-    one = cut(run.odometry, run.stamps_ns, STRAIGHT)
-    both = join([one, one], [0, len(run.stamps_ns)])
-    assert len(both) == 8
-    assert not both[3].linked
+    single, count = cut(run.odometry, run.stamps_ns, STRAIGHT), len(run.stamps_ns)
+    both = join([single, single], [0, count])
+    assert len(both) == 8 and not both[3].linked
     assert [s.run for s in both] == [0] * 4 + [1] * 4
-    assert both.images.used == 2 * one.images.used
-    owner = assignment(both, 2 * len(run.stamps_ns))
-    assert np.array_equal(np.flatnonzero(owner == 4), one[0].images + len(run.stamps_ns))
-    assert (owner == -1).sum() == 2 * len(run.stamps_ns) - both.images.used
+    assert both.images.used == 2 * single.images.used
+    owner = assignment(both, 2 * count)
+    assert np.array_equal(np.flatnonzero(owner == 4), single[0].images + count)
+    assert (owner == -1).sum() == 2 * count - both.images.used
 
 
 def test_a_drive_without_segments_says_what_to_do():
-    for part, config, remedy in (
+    for twists, config, remedy in (
         (stand(10.0), ANY, 'robot drives'),
         (turn(6.0), STRAIGHT, 'straight lines'),
     ):
+        run = drive(twists)
         with pytest.raises(DataError, match=remedy):
-            cut(*drive_of(part), config)
+            cut(run.odometry, run.stamps_ns, config)
 
 
 @pytest.mark.parametrize(('config', 'gyro'), [(ANY, True), (STRAIGHT, False)])
 def test_the_frame_of_the_odometry_turns_the_starts_and_nothing_else(config, gyro):
     twists, start = criss_cross(6)
-    run = drive(twists, start=start)
-    rate = run.gyro if gyro else None
-    one = cut(run.odometry, run.stamps_ns, config, rate)
-    elsewhere = compose(np.array([30.0, -7.0, 2.5]), run.odometry.poses)
-    there = dataclasses.replace(run.odometry, poses=elsewhere)
-    other = cut(there, run.stamps_ns, config, rate)
-    assert len(one) == len(other)
-    for a, b in zip(one, other, strict=True):
-        moved = compose(np.array([30.0, -7.0, 2.5]), a.start)
-        assert np.allclose(relative(moved, b.start), 0, atol=1e-9)
+    run, frame = drive(twists, start=start), np.array([30.0, -7.0, 2.5])
+    elsewhere = replace(run.odometry, poses=compose(frame, run.odometry.poses))
+    here, there = (
+        cut(odometry, run.stamps_ns, config, run.gyro if gyro else None)
+        for odometry in (run.odometry, elsewhere)
+    )
+    for a, b in zip(here, there, strict=True):
+        assert np.allclose(relative(compose(frame, a.start), b.start), 0, atol=1e-9)
         assert np.allclose(a.path, b.path) and np.allclose(a.headings, b.headings)
         if a.linked:
             assert a.turn_rad == pytest.approx(b.turn_rad)
             assert a.displacement == pytest.approx(b.displacement)
-
-
-@pytest.mark.parametrize('gap', [(2.0, 10.0), (15.0, 1e9)])
-def test_where_the_gyro_pauses_the_wheels_go_on(gap, bias=0.02):
-    run = drive(np.vstack([SQUARE, SQUARE]))
-    seconds = (run.gyro.stamps_ns - run.gyro.stamps_ns[0]) * 1e-9
-    biased = dataclasses.replace(run.gyro, omega=run.gyro.omega + bias)
-    keep = (seconds < gap[0]) | (seconds > gap[1])
-    kept = YawRate(*(part[keep] for part in (biased.stamps_ns, biased.omega, biased.variance)))
-    segments = cut(run.odometry, run.stamps_ns, STRAIGHT, kept)
-    assert segments.odometry.skipped['in a gap of the gyroscope'] > 0
-    turns = [s.turn_rad - bias * s.turn_time_s for s in segments.items[:-1]]
-    assert turns == pytest.approx([np.pi / 2] * 7, abs=0.01)

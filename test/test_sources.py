@@ -39,9 +39,8 @@ def config(**values):
 
 
 class Script:
-    """Captures that play given steps: a level is a picture, an exception is raised, None ends.
-
-    `forever` repeats the last step of a capture; an Event blocks the read until it is set.
+    """Captures that play given steps: a level is a picture, an exception is raised, None ends, an
+    Event blocks until it is set. `forever` repeats the last step of a capture.
     """
 
     def __init__(self, *captures, live=True, forever=False):
@@ -66,7 +65,8 @@ class Script:
                     return
                 if isinstance(step, threading.Event):
                     step.wait(PATIENCE_S)
-                yield picture(255 if isinstance(step, threading.Event) else step)
+                    step = 255
+                yield picture(step)
         finally:
             self.closed += 1
 
@@ -100,22 +100,28 @@ def wait_for(condition, feed=None):
         time.sleep(0.002)
 
 
+def arrived(received, count):
+    return [received.get(timeout=PATIENCE_S) for _ in range(count)]
+
+
+def ended(feed):
+    return lambda: feed.status().state == 'ended'
+
+
 def test_pictures_arrive_in_order_until_the_end(run_feed):
     """Equal ones of a file are no fault."""
     script = Script([1, 2, *[7] * 60, None], live=False)
     feed, received = run_feed(script)
-    assert [received.get(timeout=PATIENCE_S) for _ in range(62)] == [1, 2, *[7] * 60]
-    wait_for(lambda: feed.status().state == 'ended')
-    wait_for(lambda: script.closed == 1)
-    assert script.opened == 1 and feed.check().state == 'ended' and feed.status().lost == 0
+    assert arrived(received, 62) == [1, 2, *[7] * 60]
+    wait_for(lambda: feed.check().state == 'ended' and script.closed == 1)
+    assert script.opened == 1 and feed.status().lost == 0
 
 
 def test_a_disconnected_camera_is_opened_again(run_feed):
     script = Script([1, 2, CameraError('unplugged')], CameraError('not there'), [3, 4, 5, None])
     feed, received = run_feed(script)
-    assert [received.get(timeout=PATIENCE_S) for _ in range(5)] == [1, 2, 3, 4, 5]
-    assert script.opened == 3
-    assert feed.status().lost == 2
+    assert arrived(received, 5) == [1, 2, 3, 4, 5]
+    assert script.opened == 3 and feed.status().lost == 2
     feed, _ = run_feed(Script(CameraError('not there')))
     wait_for(lambda: feed.status().state == 'lost')
     assert feed.status().problem == 'not there'
@@ -127,7 +133,7 @@ def test_a_silent_camera_is_abandoned_and_opened_again(run_feed):
     feed, received = run_feed(script)
     assert received.get(timeout=PATIENCE_S) == 1
     wait_for(lambda: script.opened == 2, feed)
-    assert [received.get(timeout=PATIENCE_S) for _ in range(2)] == [2, 3]
+    assert arrived(received, 2) == [2, 3]
     assert feed.status().lost == 1
     released.set()  # the read that hung returns a picture, which nobody wants any more
     wait_for(lambda: script.closed == 2)
@@ -135,24 +141,21 @@ def test_a_silent_camera_is_abandoned_and_opened_again(run_feed):
 
 
 def test_a_frozen_camera_is_opened_again_until_it_moves(run_feed):
-    script = Script([1, 2], [2], [2], [3, 4, 5, None])
-    script.forever = True
+    script = Script([1, 2], [2], [2], [3, 4, 5, None], forever=True)
     feed, received = run_feed(script)
     wait_for(lambda: script.opened == 2)
     assert 'repeated' in feed.status().problem or feed.status().state == 'lost'
-    wait_for(lambda: script.opened == 4)
-    wait_for(lambda: feed.status().state == 'ended')
-    levels = list(received.queue)
-    assert levels[-3:] == [3, 4, 5]
-    assert feed.status().lost == 3
+    wait_for(ended(feed))
+    assert list(received.queue)[-3:] == [3, 4, 5]
+    assert script.opened == 4 and feed.status().lost == 3
 
 
-def test_a_defect_in_the_thread_is_shown_and_the_source_opened_again(run_feed):
+def test_a_defect_in_the_thread_is_reported_and_the_source_opened_again(run_feed):
     rejected = []
     script = Script([1, ZeroDivisionError()], [2, ZeroDivisionError()], [3, None], live=False)
     feed, received = run_feed(script, rejected.append)
-    assert [received.get(timeout=PATIENCE_S) for _ in range(3)] == [1, 2, 3]
-    wait_for(lambda: feed.status().state == 'ended')
+    assert arrived(received, 3) == [1, 2, 3]
+    wait_for(ended(feed))
     assert feed.status().lost == 2
     assert rejected == ['internal error: ZeroDivisionError'] * 2
 
@@ -163,7 +166,7 @@ def test_files_wait_until_they_are_wanted(run_feed):
     wait_for(lambda: script.opened == 1)
     assert received.empty()
     wanted.set()
-    wait_for(lambda: feed.status().state == 'ended')
+    wait_for(ended(feed))
     assert received.qsize() == 2
 
 
@@ -175,8 +178,7 @@ def test_nothing_is_delivered_after_stop(run_feed):
     assert script.closed == 1
     count = received.qsize()
     feed.check()
-    assert script.opened == 1
-    assert received.qsize() == count
+    assert script.opened == 1 and received.qsize() == count
 
 
 def test_a_folder_in_order_of_names_with_the_unreadable_named(tmp_path, run_feed):
@@ -187,9 +189,9 @@ def test_a_folder_in_order_of_names_with_the_unreadable_named(tmp_path, run_feed
     rejected = []
     values = {'source': 'folder', 'source_path': str(tmp_path), 'source_rate': 1000.0}
     feed, received = run_feed(opener(config(**values)), rejected.append, **values)
-    wait_for(lambda: feed.status().state == 'ended')
-    assert list(received.queue) == [1, 2, 4]
-    assert len(rejected) == 1 and 'c.png' in rejected[0]
+    wait_for(ended(feed))
+    (text,) = rejected
+    assert list(received.queue) == [1, 2, 4] and 'c.png' in text
 
 
 def test_video(tmp_path, run_feed):
@@ -202,19 +204,20 @@ def test_video(tmp_path, run_feed):
     writer.release()
     values = {'source': 'video', 'source_path': path, 'source_rate': 500.0}
     feed, received = run_feed(opener(config(**values)), **values)
-    levels = [received.get(timeout=PATIENCE_S) for _ in range(3)]
-    np.testing.assert_allclose(levels, [10, 100, 200], atol=3)
-    wait_for(lambda: feed.status().state == 'ended')
+    assert arrived(received, 3) == pytest.approx([10, 100, 200], abs=3)
+    wait_for(ended(feed))
 
 
 def test_sources_that_are_not_there_are_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for source, path, words in (
-        ('device', '', 'source_path is empty'), ('topic', '', 'topic'),
+        ('topic', '', 'topic'),
+        ('device', '', 'source_path is empty'),
         ('device', '/dev/no_such_camera', 'no_such_camera'),
-        ('video', 'no_such.mp4', r'no_such\.mp4'), ('folder', 'no_such_folder', 'no_such_folder'),
+        ('video', 'no_such.mp4', r'no_such\.mp4'),
+        ('folder', 'no_such_folder', 'no_such_folder'),
         ('folder', '.', 'no images'),
-    ):  # fmt: skip
+    ):
         with pytest.raises(CameraError, match=words):
             opener(config(source=source, source_path=path))()
 

@@ -4,7 +4,7 @@
 
 drives            odometry of all drives, corrected by what images show, cut, learned from
   points, measured_points     read, judged, and laid on the map
-  motion_check, motion_sources     whether all sources of a drive tell the same motion
+  motion_check, motion_sources     whether all sources of a drive's motion agree
   dead_reckoning, odometry_errors, segments     odometry, corrected, in rigid pieces
 learning          the map of segments and features, of slow ones and of turned maps
   stack              the images, and the unknown poses of segments and yaw-rate biases

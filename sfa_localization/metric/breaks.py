@@ -22,7 +22,7 @@ from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
 from sfa_localization.keyframes.closures import LIKE
 from sfa_localization.metric.dead_reckoning import pauses, spaced, summed
 
-Textures = tuple[Stamps, NDArray[np.int8]]
+StampedTextures = tuple[Stamps, NDArray[np.int8]]
 """Stamps (N,) of images, and small versions of these (N, rows, columns), of zero mean around the
 robot."""
 STEP = 0.2
@@ -64,14 +64,12 @@ def _jumps(odometry: Odometry) -> tuple[Mask, Array, float]:
         means = [each[:, :3] / np.maximum(each[:, 3:], period) for each in (before, after)]
         usual = (before + after)[:, :3] / np.maximum((before + after)[:, 3:], period) * dt[:, None]
         noise = MEDIAN_TO_STD * float(np.median(np.abs(step - usual)[:, :2].max(1)))
-        distance = np.full((2, len(step)), np.inf)
-        for speed in (*means, single[:-2], single[2:]):
-            rest = step - speed * shortest_s[:, None]
-            for k, axes in enumerate((slice(0, 2), slice(2, 3))):
-                distance[k] = np.minimum(
-                    distance[k], beyond(rest[:, axes], more_s, [speed[:, axes]])
-                )
-        jump = distance.max(axis=0) > tolerance(np.maximum(dt, period), noise)
+        rest = [(step - v * shortest_s[:, None], v) for v in (*means, single[:-2], single[2:])]
+        distance = [
+            np.min([beyond(r[:, axes], more_s, [v[:, axes]]) for r, v in rest], axis=0)
+            for axes in (slice(0, 2), slice(2, 3))
+        ]
+        jump = np.max(distance, axis=0) > tolerance(np.maximum(dt, period), noise)
     return jump, usual, noise
 
 
@@ -116,7 +114,7 @@ def contradicted(
     sentences on that.
     """
     stamps, step = odometry.stamps_ns, relative(odometry.poses[:-1], odometry.poses[1:])
-    seconds, length = summed(np.diff(stamps) * 1e-9), np.hypot(step[:, 0], step[:, 1])
+    seconds, length = (stamps - stamps[0]) * 1e-9, np.hypot(step[:, 0], step[:, 1])
     moved = length + np.abs(step[:, 2])
     still_s = np.where(moved < STANDING * np.diff(seconds), np.diff(seconds), 0.0)
     inside = (stamps_ns >= stamps[0]) & (stamps_ns <= stamps[-1])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, Complex, Indices, Mask
+from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, Complex, Indices, Mask, wrap_angle
 from sfa_localization.data.run import Count, Odometry, Stamps, YawRate, differences
 from sfa_localization.metric.settings import SegmentConfig
 
@@ -28,17 +28,6 @@ TURN_SLIDE = 0.05
 SEEN_TURN_SLIDE = 0.01
 """m per rad: what remains of it where images correct the turns; 0.007 for two real indoor robots.
 With more, the links are so weak that maps shrink by 4 %."""
-
-
-@dataclass(frozen=True, slots=True)
-class TurnCorrection:
-    """What to add to the yaw of a track: `yaw` (N,) rad at stamps (N,), linear between them, and
-    the `noise` of the resulting turns, rad per square root of s.
-    """
-
-    stamps_ns: Stamps
-    yaw: Array
-    noise: float
 
 
 class Way(NamedTuple):
@@ -87,7 +76,7 @@ class OdometryTrack:
         yaw, variances = np.unwrap(odometry.poses[:, 2]), odometry.variances[:, 1]
         poses = np.column_stack([odometry.poses[:, :2], yaw])
         if config.yaw_source != 'odometry' and yaw_rate and len(yaw_rate.stamps_ns) > 1:
-            turns, variances = _gyro_turns(stamps, yaw, variances, ~breaks, yaw_rate, skipped)
+            turns, variances = _gyro_turns(odometry, ~breaks, yaw_rate, skipped)
             yaw = yaw[0] + summed(turns)
         elif config.yaw_source == 'gyro':
             raise DataError('yaw_source is gyro, but there is no yaw rate: name the imu topic')
@@ -124,12 +113,13 @@ class OdometryTrack:
         """Turned in either direction since the start (N,), rad."""
         return summed(np.abs(np.diff(self.yaw)))
 
-    def corrected(self, turns: TurnCorrection) -> OdometryTrack:
-        """The same wheel steps with corrected turns."""
-        at = (turns.stamps_ns - self.stamps_ns[0]) * 1e-9
-        track = self._turned(self.yaw + np.interp(self.seconds, at, turns.yaw))
-        variance = turns.noise**2 * self.seconds
-        return replace(track, yaw_variance=variance, slide=SEEN_TURN_SLIDE)
+    def corrected(self, stamps_ns: Stamps, yaw: Array, noise: float) -> OdometryTrack:
+        """The same wheel steps, with `yaw` (M,) rad added at stamps (M,), linear between them; the
+        turns then have this noise, rad per square root of s.
+        """
+        at = (stamps_ns - self.stamps_ns[0]) * 1e-9
+        track = self._turned(self.yaw + np.interp(self.seconds, at, yaw))
+        return replace(track, yaw_variance=noise**2 * self.seconds, slide=SEEN_TURN_SLIDE)
 
     def driven(self, way: Way) -> OdometryTrack:
         """The same turns with the corrected way."""
@@ -185,22 +175,18 @@ def pauses(odometry: Odometry) -> Mask:
 
 
 def _gyro_turns(
-    stamps: Stamps,
-    yaw: Array,
-    variances: Array,
-    unbroken: Mask,
-    gyro: YawRate,
-    skipped: Counter[str],
+    odometry: Odometry, unbroken: Mask, gyro: YawRate, skipped: Counter[str]
 ) -> tuple[Array, Array]:
     """Turns (N - 1,) between the odometry's stamps, and the variances (N,) of their rate.
 
     They are the gyroscope's where it has readings all along a step. Elsewhere they are the
     odometry's plus the gyroscope's mean offset, so that one bias remains for the whole drive.
     """
+    stamps, variances = odometry.stamps_ns, odometry.variances[:, 1]
     seconds, at = (gyro.stamps_ns - stamps[0]) * 1e-9, (stamps - stamps[0]) * 1e-9
     areas = (gyro.omega[1:] + gyro.omega[:-1]) / 2 * np.diff(seconds)
     turns = np.diff(np.interp(at, seconds, summed(areas)))
-    wheels, dt = np.diff(yaw), np.diff(at)
+    wheels, dt = wrap_angle(np.diff(odometry.poses[:, 2])), np.diff(at)
     measured = without_pause(stamps[:-1], stamps[1:], gyro.stamps_ns, GAP_MAX_S)
     both = measured & unbroken
     if not both.any():

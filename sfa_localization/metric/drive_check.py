@@ -45,7 +45,7 @@ class Diagnostics:
     """Standard deviation of a segment's direction in the map: see SURE_SHARE."""
 
     @property
-    def one_route(self) -> bool:
+    def single_route(self) -> bool:
         """Whether no place is passed on different tracks, so that only odometry connects them."""
         return min(self.extent_m) < _WIDTH_MIN_M or self.crossings == 0
 
@@ -84,7 +84,7 @@ def diagnose(fit: MapFit) -> Diagnostics:
 
 def check(diagnostics: Diagnostics) -> None:
     """Raises DataError, naming what to drive, if the data do not determine the map of an area."""
-    if diagnostics.one_route:
+    if diagnostics.single_route:
         return
     uncertain = min(float(np.rad2deg(diagnostics.angle_std_rad)), 180.0)
     if uncertain > ANGLE_STD_MAX_DEG:
@@ -95,10 +95,8 @@ def check(diagnostics: Diagnostics) -> None:
         )
 
 
-def is_one_route(places: Complex, length_m: float) -> bool:
-    """`Diagnostics.one_route` of a drive through places (M,), x + i y in meters by the odometry, in
-    pieces of a length.
-    """
+def is_single_route(places: Complex, length_m: float) -> bool:
+    """`Diagnostics.single_route` of places (M,), x + i y m by odometry, in pieces of a length."""
     steps = np.abs(np.diff(places, prepend=places[:1]))
     piece = np.floor(np.cumsum(steps) / length_m).astype(int)
     first = np.flatnonzero(np.diff(piece, prepend=-1))

@@ -87,10 +87,12 @@ class Drives:
         """Dead reckoning of each drive, with the turns of its images where these are better."""
         runs = [drive.run for drive in self.items]
         tracks = [OdometryTrack.of(run.odometry, self.config, run.yaw_rate) for run in runs]
-        turns = corrections(self._headings(tracks), self.closures)
-        if turns is None:
+        better = corrections(self._headings(tracks), self.closures)
+        if better is None:
             return tracks
-        return [track.corrected(turn) for track, turn in zip(tracks, turns, strict=True)]
+        yaws, noise = better
+        changes = zip(tracks, self.items, yaws, strict=True)
+        return [track.corrected(drive.stamps_ns, yaw, noise) for track, drive, yaw in changes]
 
     def _headings(self, tracks: Sequence[OdometryTrack]) -> list[Headings]:
         pairs = zip(tracks, self.items, strict=True)
@@ -173,14 +175,14 @@ class Drives:
 def rig_of(drives: Drives, segments: Segments) -> Rig:
     """What was learned of the robot."""
     usual, delays = Rig(), [d.delay_ns * 1e-9 for d in drives.items if d.delay_ns is not None]
-    ways = np.array([way or Way(loss_std=usual.turn_loss.std) for way in segments.ways])
+    ways = [way or Way(loss_std=usual.turn_loss.std) for way in segments.ways]
+    losses, loss_std = [way.loss for way in ways], max(way.loss_std for way in ways)
     scale_std = segments.points.settled.scale_std if segments.points else SCALE_STD
-    scale, loss, _ = ways.mean(axis=0).tolist()
     return Rig(
         **segments.mount.quantities,
         camera_delay=usual.camera_delay._replace(value=float(np.median(delays or [0.0]))),
-        wheel_scale=Quantity(scale, scale_std),
-        turn_loss=Quantity(loss, math.hypot(float(ways[:, 1].std()), float(ways[:, 2].max()))),
+        wheel_scale=Quantity(float(np.mean([way.scale for way in ways])), scale_std),
+        turn_loss=Quantity(float(np.mean(losses)), math.hypot(float(np.std(losses)), loss_std)),
     )
 
 
@@ -211,9 +213,9 @@ def learn_map(
         except DataError as error:
             logger.warning('the way that wheels lose in turns stays in the map: %s', error)
             break
-    if result.diagnostics.one_route and strict:
+    if result.diagnostics.single_route and strict:
         raise DataError(f'{ROUTE}, or train without --strict')
-    if result.diagnostics.one_route:
+    if result.diagnostics.single_route:
         logger.warning(ROUTE)
     return segments, result
 

@@ -140,7 +140,7 @@ def learn_metric(
     held = hold_out(fit)
     overfits = held.explained < LITTLE and held.variance > OVERFIT * fit.variance
     by_features = config.solver == 'certified' and problem.graph is None
-    if overfits and by_features and not diagnose(fit).one_route:
+    if overfits and by_features and not diagnose(fit).single_route:
         fit = choose(replace(problem, graph=Graph.of(segments)), scale)
         held = hold_out(fit)
     if fit.problem.graph is not None:

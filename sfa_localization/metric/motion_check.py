@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
-from sfa_localization.data.geometry import Array, Complex, relative, wrap_angle
+from sfa_localization.data.geometry import Array, Complex, Indices, relative, wrap_angle
 from sfa_localization.data.odometry_steps import JUMP, NOISE
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
-from sfa_localization.metric.breaks import Textures, contradicted, parted
+from sfa_localization.metric.breaks import StampedTextures, contradicted, parted
 from sfa_localization.metric.motion_sources import (
     ENOUGH,
     EQUAL,
@@ -60,6 +60,11 @@ _IMAGES_REMEDIES = {
     'sign': 'set `clockwise` of the panorama, or `mirrored` of the calibration',
     'scale': 'a panorama shows all around once, so that a full turn shifts it by its width; or is '
     'the track of the wheels too wide?',
+}
+_WAY_REMEDIES = {
+    'alike': 'is the heading of the pose right?',
+    'sign': 'correct the sign of twist.linear.x, or the heading of the pose',
+    'scale': 'publish m and m/s',
 }
 
 
@@ -127,7 +132,7 @@ def check_motion(
     images: tuple[Stamps, Array] | None = None,
     gyro: YawRate | None = None,
     panoramas: bool = True,
-    views: Textures | None = None,
+    views: StampedTextures | None = None,
 ) -> MotionCheck:
     """Compare all sources of a drive: see `sources_of`, and `contradicted` for the `views`.
 
@@ -145,10 +150,10 @@ def check_motion(
     turns = check.pair(POSE, IMAGES)
     if images is not None and not panoramas and turns and turns.scale < 0:
         return check_motion(odometry, (images[0], -images[1]), gyro, panoramas, views)
-    _judge_way(check)
+    _judge(check, 'way')
     if not impossible:
         _judge_axes(check)
-        _judge_turns(check)
+        _judge(check, 'turns')
         _judge_clocks(check)
         if views is not None:
             late_ns = round(turns.late_s * 1e9) if turns else 0
@@ -163,17 +168,21 @@ def check_motion(
 
 
 def _impossible(sources: Sequence[Source]) -> Iterator[str]:
-    """Stamps in other units, and speeds that no robot reaches."""
+    """Stamps in other units, and speeds that no robot reaches in a tenth of its seconds."""
     for source in sources:
-        problem = _stamp_problem(source.stamps_ns)
+        problem, at = _stamp_problem(source.stamps_ns), _seconds(source.stamps_ns)
         if problem and source.name != TWIST:
             yield f'{source.name}: {problem}'
-        elif not problem and 'way' in source.sums:
-            # The 90th percentile of the mean speeds of whole seconds, m/s.
-            seconds = (source.stamps_ns - source.stamps_ns[0]) * 1e-9
-            way = np.interp(np.arange(seconds[-1] + 1), seconds, source.sums['way'])
-            if (speed := np.percentile(np.abs(np.diff(way)), 90)) > FASTEST_MPS:
+        elif not problem and 'way' in source.sums and len(at) > 1:
+            time_s = np.maximum(np.diff(source.stamps_ns[at]) * 1e-9, 0.1)
+            speed = np.percentile(np.abs(np.diff(source.sums['way'][at])) / time_s, 90)
+            if speed > FASTEST_MPS:
                 yield f'{source.name} drives at {speed:.3g} m/s: publish meters, not millimeters'
+
+
+def _seconds(stamps_ns: Stamps) -> Indices:
+    """The first row of each second of stamps (N,)."""
+    return np.flatnonzero(np.diff((stamps_ns - stamps_ns[0]) // 1_000_000_000, prepend=-1))
 
 
 def _stamp_problem(stamps_ns: Stamps) -> str:
@@ -190,9 +199,8 @@ def _ahead(odometry: Odometry) -> Complex:
     """The way of each second, m, along (real) and to the left of its mean heading. Seconds with
     much turn are left out: their chord does not show the heading.
     """
-    stamps, poses = odometry.stamps_ns, odometry.poses
-    at = np.flatnonzero(np.diff((stamps - stamps[0]) // 1_000_000_000, prepend=-1))
-    step = relative(poses[at[:-1]], poses[at[1:]])
+    at = _seconds(odometry.stamps_ns)
+    step = relative(odometry.poses[at[:-1]], odometry.poses[at[1:]])
     chord = (step[:, 0] + 1j * step[:, 1]) * np.exp(-0.5j * step[:, 2])
     whole = odometry.part[at[:-1]] == odometry.part[at[1:]]
     return np.asarray(chord[whole & (np.abs(chord) > JUMP) & (np.abs(step[:, 2]) < SLIGHT_TURN)])
@@ -226,27 +234,9 @@ def _judge_axes(check: MotionCheck) -> None:
         (check.wrong if sideways > 2 * SIDEWAYS * ahead else check.notes).append(text)
 
 
-def _judge_way(check: MotionCheck) -> None:
-    """The ways of pose and twist."""
-    pair = check.pair(POSE, TWIST, 'way')
-    if pair is None:
-        return
-    if pair.differs('alike'):
-        check.notes.append(f'{TWIST} does not drive with {POSE}: is the heading of the pose right?')
-    elif pair.differs('sign'):
-        check.wrong.append(
-            f'{TWIST} drives backwards where {POSE} drives ahead: correct the sign of '
-            'twist.linear.x, or the heading of the pose'
-        )
-    elif pair.differs('scale'):
-        text = f'{TWIST} drives {pair.scale:.3g} times as far as {POSE}{unit(pair)}'
-        skids = 1 / SKIDDING < pair.scale < SKIDDING
-        (check.notes if skids else check.wrong).append(f'{text}: publish m and m/s')
-
-
-def _judge_turns(check: MotionCheck) -> None:
-    """Report the minority for each kind of difference."""
-    pairs = [pair for pair in check.pairs if pair.what == 'turns']
+def _judge(check: MotionCheck, what: str) -> None:
+    """Report the minority for each kind of difference of the turns, or of the way."""
+    pairs = [pair for pair in check.pairs if pair.what == what]
     names = {name for pair in pairs for name in (pair.a, pair.b)}
     for kind in ('alike', 'sign', 'scale'):
         groups = _groups(pairs, kind, names)
@@ -279,7 +269,8 @@ def _report(check: MotionCheck, kind: str, group: set[str], others: set[str], pa
         'sign': 'opposite to',
         'scale': f'{factor:.3g} times as far{unit(pair)} as',
     }[kind]
-    text = f'{_listed(group)} {"turn" if group == {IMAGES} else "turns"} {how} {_listed(others)}'
+    verb = 'drives' if pair.what == 'way' else 'turn' if group == {IMAGES} else 'turns'
+    text = f'{_listed(group)} {verb} {how} {_listed(others)}'
     drastic = kind == 'sign' or (kind == 'scale' and not 1 / SKIDDING < factor < SKIDDING)
     if GYRO in group:
         _correct_gyro(check, kind, text, factor)
@@ -291,6 +282,8 @@ def _report(check: MotionCheck, kind: str, group: set[str], others: set[str], pa
         # Skidding wheels turn farther than the robot does.
         images_err = factor > 1 or _devices(others) > 1
         wrong = {'alike': pair.independent, 'sign': True, 'scale': images_err}[kind]
+    elif pair.what == 'way':
+        remedy, wrong = _WAY_REMEDIES[kind], drastic
     elif group >= {POSE, TWIST}:
         remedy = 'swap left and right wheel' if kind == 'sign' else 'do the wheels skid?'
         wrong = drastic

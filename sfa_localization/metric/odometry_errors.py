@@ -1,16 +1,15 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of the odometry that images show: its turns, and the way that its wheels lose in them.
+"""Errors of the odometry that images show: its turns, and the way that wheels lose in turns.
 
-Wheels that slip err in turns by tens of degrees a minute, the sums of shifts between images by one,
-or by more than any wheel among trees near and far. A loop closure measures the turn since the robot
-was at the place before. So the residuals of both at the closures are their noise, and the weights
-of their mean.
+Turns by slipping wheels err by tens of degrees a minute; the sums of shifts between images by one
+degree, but by more than wheels among trees near and far. A loop closure measures the turn since the
+robot was at the place before: its residuals give the noise of both, and the weights of their mean.
 
 Wheels count more way in a turn than the robot drives: they slide, and controllers slow down. Four
-small robots lost 0.07 to 0.1 m per radian, half of the error of their odometry. Images of a map, in
-which this averages out where tracks cross, move by scale D - loss L between images some decimeters
-apart, with the odometry's displacement D turned into the map, and what one m/rad takes from it, L.
+small robots lost 0.07 to 0.1 m per radian, half of the error of their odometry. In a map this
+averages out where tracks cross. Over some decimeters its images move by scale D - loss L, where D
+is the odometry's displacement in the frame of the map, and L its change by a loss of 1 m/rad.
 """
 
 from __future__ import annotations
@@ -25,13 +24,7 @@ from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_a
 from sfa_localization.data.run import Run, Stamps
 from sfa_localization.data.statistics import MEDIAN_TO_STD, evenly, outlier_factor
 from sfa_localization.keyframes.closures import Closures, driven
-from sfa_localization.metric.dead_reckoning import (
-    OdometryTrack,
-    TurnCorrection,
-    Way,
-    spaced,
-    summed,
-)
+from sfa_localization.metric.dead_reckoning import OdometryTrack, Way, spaced, summed
 
 CLOSURES_MIN = 30
 """Fewer closures show by chance that images turn better."""
@@ -50,8 +43,9 @@ show a loss in turns."""
 PAIRS_MIN = 50
 """Fewer pairs of images are no evidence."""
 REACH_M, UNEQUAL = (3.0, 50.0), 0.02
-"""Least distance of two places that two drives have passed, many times the error of closures, and
-longest way between them; two pairs of equal wheels differ by less than the third."""
+"""The scale of two drives is compared between places that are farther apart than the first, many
+times the error of closures, with less way between them; that of equal wheels differs by less than
+the third."""
 # Closures of two drives that are paired, and rounds of reweighting until the fit settles.
 _PAIRED, _ROUNDS = 400, 10
 
@@ -65,7 +59,6 @@ class Headings:
     the sum of the shifts between `images`, whose sign may be either.
     """
 
-    stamps_ns: Stamps
     time_s: Array
     track: Array
     images: Array
@@ -77,11 +70,12 @@ class Headings:
         time_s = (stamps_ns - track.stamps_ns[0]) * 1e-9
         yaw = np.interp(time_s, track.seconds, track.yaw)
         part = track.part[np.searchsorted(track.stamps_ns[1:], stamps_ns, 'right')]
-        return cls(stamps_ns, time_s, yaw, np.unwrap(np.asarray(images, float)), part)
+        return cls(time_s, yaw, np.unwrap(np.asarray(images, float)), part)
 
 
-def corrections(drives: Sequence[Headings], closures: Closures) -> list[TurnCorrection] | None:
-    """Of each drive; None where the closures do not show that its images turn better.
+def corrections(drives: Sequence[Headings], closures: Closures) -> tuple[list[Array], float] | None:
+    """What to add to the yaw (N,) rad of each drive at its images, and the noise of the turns then,
+    rad per square root of s; None if the closures do not show that images turn better.
 
     The closures number the images of all drives one after the other.
     """
@@ -94,14 +88,10 @@ def corrections(drives: Sequence[Headings], closures: Closures) -> list[TurnCorr
     if BETTER * images > odometry:
         return None
     total = odometry**2 + images**2
+    # Headings differ by whole turns, and between neighboring images by less than half of one.
+    differences = [np.unwrap(sign * drive.images - drive.track) for drive in drives]
     share, noise = odometry**2 / total, odometry * images / np.sqrt(total)
-    turns = []
-    for drive in drives:
-        # Shifts are known to whole turns: between neighboring images both differ by less than half.
-        difference = np.unwrap(sign * drive.images - drive.track)
-        yaw = share * (difference - difference[0])
-        turns.append(TurnCorrection(drive.stamps_ns, yaw, noise))
-    return turns
+    return [share * (each - each[0]) for each in differences], float(noise)
 
 
 def _residuals(drives: Sequence[Headings], closures: Closures) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
-from itertools import pairwise
+from itertools import compress, pairwise
 
 import numpy as np
 
@@ -143,7 +143,11 @@ def cut_track(track: OdometryTrack, image_stamps_ns: Stamps, config: SegmentConf
     skipped, straight = Counter[str](), config.segments == 'straight'
     poses = ImagePoses.on(track, np.asarray(image_stamps_ns, np.int64), skipped)
     poses = _without_standstill(poses, skipped)
-    groups = _lines(track, poses, skipped) if straight else _pieces(poses, skipped)
+    candidates = _lines(poses, track, skipped) if straight else _pieces(poses)
+    least_m = LINE_LENGTH_MIN_M if straight else 2 * IMAGE_STEP_MIN_M
+    long = [len(g) >= IMAGES_MIN and np.ptp(poses.length[g]) >= least_m for g in candidates]
+    groups = list(compress(candidates, long))
+    skipped['in too short a segment'] += sum(map(len, candidates)) - sum(map(len, groups))
     if not groups:
         remedy = (
             'drive straight lines with turns on the spot, or use segments: any'
@@ -275,7 +279,7 @@ def _without_standstill(poses: ImagePoses, skipped: Counter[str]) -> ImagePoses:
     return poses.take(keep)
 
 
-def _lines(track: OdometryTrack, poses: ImagePoses, skipped: Counter[str]) -> list[Indices]:
+def _lines(poses: ImagePoses, track: OdometryTrack, skipped: Counter[str]) -> list[Indices]:
     """Straight lines: driven, not turning, between turns on the spot."""
     half, seconds = _SMOOTHING_S / 2, track.seconds
     window = np.clip([poses.time_s - half, poses.time_s + half], 0.0, seconds[-1])
@@ -296,10 +300,10 @@ def _lines(track: OdometryTrack, poses: ImagePoses, skipped: Counter[str]) -> li
                 lines.append(group[start:i])
                 start = i
         lines.append(group[start:])
-    return _long_enough(poses, lines, LINE_LENGTH_MIN_M, skipped)
+    return lines
 
 
-def _pieces(poses: ImagePoses, skipped: Counter[str]) -> list[Indices]:
+def _pieces(poses: ImagePoses) -> list[Indices]:
     """Pieces of any drive, as even as the bounds on length and error allow."""
     pieces: list[Indices] = []
     for group in _stretches(poses, np.arange(len(poses.images))):
@@ -307,41 +311,24 @@ def _pieces(poses: ImagePoses, skipped: Counter[str]) -> list[Indices]:
         number = max(int(np.ceil(wear[-1] - 1e-9)), 1)
         owner = np.minimum(wear / max(wear[-1], 1e-9) * number, number - 1).astype(int)
         pieces += np.split(group, np.flatnonzero(np.diff(owner)) + 1)
-    return _long_enough(poses, pieces, 2 * IMAGE_STEP_MIN_M, skipped)
+    return pieces
 
 
 def _stretches(poses: ImagePoses, chosen: Indices) -> list[Indices]:
     """Split the chosen images where odometry breaks or images are missing."""
-    if len(chosen) == 0:
-        return []
     far = np.diff(poses.length[chosen]) > IMAGE_STEP_MAX_M
     return np.split(chosen, np.flatnonzero(far | (np.diff(poses.part[chosen]) != 0)) + 1)
 
 
 def _wear(poses: ImagePoses, group: Indices) -> Array:
-    """Driven since the first image (M,), in pieces: length or error uses them up."""
-    length, turned, noise = (
-        np.diff(sums[group]) for sums in (poses.length, poses.turned, poses.noise)
-    )
+    """Pieces (M,) that are used up since the first image, by length or by error."""
+    length, turned, noise = (np.diff(x[group]) for x in (poses.length, poses.turned, poses.noise))
     limit = PIECE_STD_M**2
     # The heading's variance v moves the end of a length l by v l^2 / 3, which grows with l^3.
     # Variances add up: the error of k equal steps is sqrt(k) times that of one.
     random = DISTANCE_NOISE**2 * length / limit + np.cbrt(length**2 * noise / (3 * limit))
     slip = (poses.slide + YAW_SLIP * PIECE_LENGTH_M / 2) * turned
     return summed(np.maximum(length / PIECE_LENGTH_M, random) + slip / PIECE_STD_M)
-
-
-def _long_enough(
-    poses: ImagePoses, groups: list[Indices], length_min: float, skipped: Counter[str]
-) -> list[Indices]:
-    lengths = [poses.length[group[-1]] - poses.length[group[0]] for group in groups]
-    kept = [
-        group
-        for group, length in zip(groups, lengths, strict=True)
-        if len(group) >= IMAGES_MIN and length >= length_min
-    ]
-    skipped['in too short a segment'] += sum(map(len, groups)) - sum(map(len, kept))
-    return kept
 
 
 def _segment(poses: ImagePoses, group: Indices, straight: bool) -> Segment:

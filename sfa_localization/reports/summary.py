@@ -67,7 +67,7 @@ def judgment(trained: Trained) -> tuple[str, str]:
     by_map = [pair for check in trained.checks for pair in check.pairs if pair.b == MAP]
     if any(pair.differs('alike') or pair.differs('scale') for pair in by_map):
         return BAD, 'The map cannot be used: it has another shape than its odometry.'
-    route = trained.metric.diagnostics.one_route
+    route = trained.metric.diagnostics.single_route
     if quality['explained'] < EXPLAINED and not route:
         return BAD, 'The map cannot be used: the images hardly show where they were taken.'
     if expected > USEFUL_M:

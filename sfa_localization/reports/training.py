@@ -120,7 +120,7 @@ def advice(trained: Trained, places: Array) -> list[str]:
     lines = [
         f'Cross x {x:.1f} m, y {y:.1f} m, in two directions.' for x, y, *_ in weak_places(forecast)
     ]
-    if not diagnostics.one_route:
+    if not diagnostics.single_route:
         lines += sparse_lanes(places, InspectionConfig().reach)
     if diagnostics.directions < PARALLEL:
         lines.append('Drive in other directions: most of this drive was parallel.')
