@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from sfa_localization.fusion.belief import CAPACITY, SPACING_M, PositionFix, remembered
 from sfa_localization.fusion.relocation import relocate
-from sfa_localization.fusion.track import CAPACITY, SPACING_M, PositionFix, remembered
 
 STD_M, STD_RAD = 0.1, 0.05
 

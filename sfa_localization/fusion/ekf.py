@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the belief follows from the one before and an event: predict, update, or start anew.
 
-Each is a pure function, so that late events can be placed where they belong: see `history`. The
-equations of prediction and update are filterpy's.
+Each is a pure function, so that late events can be placed where they belong: see `history`.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import (
     Belief,
-    DelayEvent,
     Event,
     Jump,
     MeasurementEvent,
@@ -27,53 +25,33 @@ from sfa_localization.fusion.belief import (
     Odometer,
     OdometryEvent,
     PoseEvent,
+    PositionFix,
     Update,
+    remembered,
 )
 from sfa_localization.fusion.camera_clock import SIGNIFICANT_STDS
-from sfa_localization.fusion.motion import (
-    DELAY,
-    ERROR,
-    LOSS,
-    SIZE,
-    YAW,
-    MotionNoise,
-    Step,
-    Twist,
-    V,
-)
+from sfa_localization.fusion.motion import DELAY, ERROR, SIZE, YAW, MotionNoise, Step, Twist, V
 from sfa_localization.fusion.odometry import COAST_S, interval, jump, received, repeats
 from sfa_localization.fusion.relocation import relocate
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import DEGRADED_YAW_RAD
-from sfa_localization.fusion.track import DrivenPath, PositionFix, remembered
 
 STARTED, ELSEWHERE = STARTS = 'started', 'restarted elsewhere'
 """Reasons of updates that take a pose from measurements alone."""
-ALIKE_SHARE = 0.2
-"""Where neighbors share less of their errors, positions are those of a sensor with white errors."""
 GATE = {2: 13.815510557964274, 3: 16.26623619623813}
-OUTLYING = {2: 3.2188758248682006, 3: 4.641627676087445}
-"""Of squared distances of right measurements, by dimensions (chi-square): one in a thousand is
-rejected. Errors of images have heavy tails, so the outlying fifth loses weight."""
+"""Squared distances, by dimensions, beyond which measurements are rejected: one right one in a
+thousand (chi-square)."""
 
 
 class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
-    """filterpy's equations as pure functions; only the last innovation is kept between calls."""
+    """The equations as pure functions, the update by filterpy, which keeps the last innovation."""
 
     def __init__(self) -> None:
         super().__init__(SIZE, 3)
-        self._next_mean: Array = np.zeros(SIZE)
 
     def predicted(self, belief: Belief, step: Step) -> Array:
         """Covariance (12, 12) after a prediction: F P F^T + Q."""
-        self.x, self.P, self._next_mean = belief.mean, belief.covariance, step.mean
-        self.F, self.Q = step.jacobian, step.noise
-        self.predict()
-        return np.asarray(self.P)
-
-    def predict_x(self, u: object = 0) -> None:
-        """filterpy's hook: the motion model is nonlinear."""
-        self.x = self._next_mean
+        return step.jacobian @ belief.covariance @ step.jacobian.T + step.noise
 
     def corrected(
         self, belief: Belief, z: Array, jacobian: Array, noise: Array
@@ -118,7 +96,7 @@ class Ekf:
         of_robot = motion.BIAS_STD, scale_std, rig.turn_loss.std, rig.camera_delay.std
         covariance = np.diag(np.square([1, 1, 1, speed_std, rate_std, *of_robot, 1, 1, 1]))
         mean = np.zeros(SIZE)
-        mean[LOSS] = rig.turn_loss.value
+        mean[motion.LOSS] = rig.turn_loss.value
         twist = Twist(0.0, 0.0, speed_std**2, rate_std**2)
         nowhere = (0.0, 0.0, 0.0)
         return Belief(stamp_ns, mean, covariance, False, nowhere, 0.0, twist, Odometer(), Memory())
@@ -130,12 +108,9 @@ class Ekf:
         belief = self.coast(belief, event.stamp_ns)
         if isinstance(event, PoseEvent):
             placed = _at_pose(belief, event.pose, event.covariance, 0.0)
-            trusted = DrivenPath(belief.path.knots, since_m=-math.inf)
-            return placed._replace(memory=Memory(), path=trusted)
-        belief = _with_delay(belief, event.late)
-        if isinstance(event, DelayEvent):  # which is why images in a row contradicted the estimate
-            return belief._replace(memory=belief.memory._replace(rejected=0))
-        return self._measured(belief, event)
+            path = belief.path._replace(placed_m=-math.inf)
+            return placed._replace(memory=Memory(), path=path)
+        return self._measured(with_delay(belief, event.late), event)
 
     # Predict.
 
@@ -236,8 +211,8 @@ class Ekf:
     def _gated(
         self, belief: Belief, event: MeasurementEvent, images: tuple[PositionFix, ...]
     ) -> Belief:
-        """Accept what lies inside the gate, where the outlying fifth loses weight. What lies
-        outside is rejected, or restarts the filter where rejected images outweigh the estimate.
+        """Accept what lies inside the gate; reject what lies outside, or restart where the rejected
+        images outweigh the estimate.
         """
         kalman, memory, size = self._kalman, belief.memory, event.value.size
         z, jacobian, white = self._linearized(belief, event)
@@ -252,9 +227,6 @@ class Ekf:
                 return self._restarted(belief, event, ELSEWHERE, *pose)
             rejected = memory._replace(rejected=memory.rejected + 1, images=images, update=update)
             return belief._replace(memory=rejected)
-        outlying = d2 / OUTLYING[size]
-        if outlying > 1 and self._correlation.share >= ALIKE_SHARE:
-            mean, covariance, _ = kalman.corrected(belief, z, jacobian, white * outlying**2)
         images = (*images[:-1], images[-1]._replace(accepted=True))
         memory = Memory(memory.support + 1, 0, event.stamp_ns, images, update)
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
@@ -282,8 +254,7 @@ class Ekf:
         distance_m: float = 0.0,
     ) -> Belief:
         """At the pose that images over a distance show, or at the event's."""
-        since_m, path = belief.traveled_m - distance_m, belief.path
-        path = path.placed(since_m) if reason == ELSEWHERE else path._replace(since_m=since_m)
+        path = belief.path._replace(placed_m=belief.traveled_m - distance_m)
         update = Update(event.stamp_ns, True, math.nan, math.nan, reason)
         memory = Memory(support=1, accepted_ns=event.stamp_ns, update=update)
         placed = _at_pose(belief, pose, covariance, self._correlation.share)
@@ -296,7 +267,7 @@ class Ekf:
         return placed._replace(memory=memory, path=path)
 
 
-def _with_delay(belief: Belief, late: Quantity) -> Belief:
+def with_delay(belief: Belief, late: Quantity) -> Belief:
     """The delay by the turns of the images replaces the state's where they contradict each other.
     The rest of the state follows by its regression on the delay (Jeffrey's rule).
     """

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 from collections import deque
 
+from sfa_localization.fusion.belief import Pose
 from sfa_localization.fusion.timeline import HISTORY_NS
-from sfa_localization.fusion.track import Pose
 
 Dated = tuple[int, Pose]
 """A stamp in ns, and map -> odom at it."""
