@@ -20,7 +20,7 @@ NOISY = {
 }  # fmt: skip
 
 
-def known(pose=(0.0, 0.0, 0.0), std=0.05, **how):
+def started(pose=(0.0, 0.0, 0.0), std=0.05, **how):
     """A filter that was told where it starts."""
     fused = PoseFilter(**how)
     fused.set_pose(START_NS, pose, std**2 * np.eye(3))
@@ -148,15 +148,15 @@ class Drive:
 
     def feed(self, fused, heading=False, start=0, stop=None, pictures=True):
         """Feed seconds [start, stop); per picture: (index, update, error, yaw error)."""
-        found = []
+        outcomes = []
         for event in self.events():
             t = seconds_of(event)
             if t < start or (stop is not None and t >= stop) or (event[1] and not pictures):
                 continue
             update = self.give(fused, event, heading)
             if event[1]:
-                found.append((event[2], update, *self.error(fused, self.pictures[event[2]])))
-        return found
+                outcomes.append((event[2], update, *self.error(fused, self.pictures[event[2]])))
+        return outcomes
 
     def error(self, fused, sample):
         """Distance and heading error against the truth at a sample; NaN without a state."""

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from filter_drives import SECOND, START_NS, Drive, from_rest, known, winding
+from filter_drives import SECOND, START_NS, Drive, from_rest, started, winding
 
 from sfa_localization.data.odometry_steps import beyond, tolerance
 from sfa_localization.data.rig import Quantity, Rig
@@ -37,7 +37,7 @@ def test_longer_steps_and_noisier_odometry_are_allowed_more():
 
 def fused_over(poses, twists, drive, images=True, stamps_ns=None):
     """(second, error m, level, reasons) at each odometry message; images every fifth are exact."""
-    fused, outputs = known(std=0.02), []
+    fused, outputs = started(std=0.02), []
     stamps_ns = drive.stamps_ns if stamps_ns is None else stamps_ns
     for i, stamp_ns in enumerate(stamps_ns.tolist()):
         fused.add_odometry(stamp_ns, *twists[i], (4e-4, 1e-4), poses[i])
@@ -118,7 +118,7 @@ def test_poses_that_are_never_filled_and_a_robot_that_stands_go_on_by_the_twist(
 @pytest.mark.parametrize('kind', [0, 1])
 def test_a_single_stamp_ahead_is_left_out_and_blocks_nothing(ahead_s, kind):
     drive, errors = Drive(seconds=10, omega_std=0.01), []
-    fused = known()
+    fused = started()
     for k, (stamp_ns, of, index) in enumerate(drive.events()):
         wrong = of == kind and index % 45 == 20
         event = stamp_ns + round(wrong * ahead_s * SECOND), of, index
@@ -132,7 +132,7 @@ def test_a_single_stamp_ahead_is_left_out_and_blocks_nothing(ahead_s, kind):
 
 
 def test_a_clock_that_is_set_ahead_is_followed_from_the_third_message_on():
-    drive, fused = Drive(seconds=10), known()
+    drive, fused = Drive(seconds=10), started()
     for stamp_ns, kind, index in drive.events():
         later_ns = round(3e5 * SECOND) * (stamp_ns - START_NS > 5 * SECOND)
         drive.give(fused, (stamp_ns + later_ns, kind, index), heading=True)
