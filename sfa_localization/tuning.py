@@ -51,7 +51,7 @@ class TuningDrive:
     """One drive: odometry, and what the model makes of all images, the unusable ones too.
 
     `truth` is for the grid search only; `filter_for` makes the filter that begins with what the
-    training found of the robot.
+    training learned of the robot.
     """
 
     odometry: Odometry
@@ -73,7 +73,7 @@ def read_drive(
     """A bag's odometry, and the poses of its images by the model. Raises BagError, DataError."""
     live = as_live(recipe, model.panorama)
     run, observations = observed(bag, Observer(model, watch), live, True, want_truth)
-    usable = sum(not one.problem for one in observations)
+    usable = sum(not image.problem for image in observations)
     if usable < MIN_IMAGES:
         raise DataError(f'{bag}: {usable} images are too few to tune on: {MIN_IMAGES} at least')
     if want_truth and run.ground_truth is None:
@@ -101,10 +101,10 @@ def tune_by_likelihood(drives: Sequence[TuningDrive], config: FilterConfig) -> F
     simplex = np.vstack([start, start + _FIRST_STEP * np.eye(len(TUNED))])
     options = {'maxfev': TRIALS, 'initial_simplex': simplex, 'xatol': 0.05, 'fatol': 1e-3}
     with progress_bar('tune by likelihood', TRIALS, 'trials', shown=True) as bar:
-        found = minimize(cost, start, method='Nelder-Mead', options=options)
-    if not math.isfinite(found.fun):
+        best = minimize(cost, start, method='Nelder-Mead', options=options)
+    if not math.isfinite(best.fun):
         raise DataError('the filter fused nothing: give longer drives, of one clock')
-    return at(found.x)
+    return at(best.x)
 
 
 def tune_by_grid(drives: Sequence[TuningDrive], config: FilterConfig) -> FilterConfig:
@@ -123,7 +123,7 @@ def likelihood_cost(drives: Sequence[TuningDrive], config: FilterConfig) -> floa
     """
     fused = [(drive, drive.filter_for(config)) for drive in drives]
     updates = [update for drive, of_drive in fused for _, update, _ in drive.fuse(of_drive)]
-    innovations = [(one.d2, one.covariance) for one in updates if one.covariance is not None]
+    innovations = [(u.d2, u.covariance) for u in updates if u.covariance is not None]
     total = sum(
         np.linalg.slogdet(spread)[1] / 2 + surprise(d2, len(spread)) for d2, spread in innovations
     )
@@ -141,8 +141,8 @@ def error_cost(drives: Sequence[TuningDrive], config: FilterConfig) -> float:
         stamps = np.array([image.stamp_ns for image in images])
         taken = drive.truth.at(stamps - fused.camera_clock.delay_ns)[:, :2]
         to_truth = align(np.array([image.position for image in images]), taken)
-        believed = np.array([np.full(3, np.nan) if one is None else one.pose for one in states])
-        apart = to_truth.apply(believed[:, :2]) - drive.truth.at(stamps)[:, :2]
-        errors.append(np.hypot(*apart[np.isfinite(apart[:, 0])].T))
+        believed = np.array([state.pose if state else np.full(3, np.nan) for state in states])
+        miss = to_truth.apply(believed[:, :2]) - drive.truth.at(stamps)[:, :2]
+        errors.append(np.hypot(*miss[np.isfinite(miss[:, 0])].T))
     every = np.concatenate(errors)
     return float(every.mean()) if len(every) else math.inf

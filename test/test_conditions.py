@@ -58,7 +58,12 @@ def test_what_the_light_adds_everywhere_moves_no_place(config):
     for share, most in ((0.3, 0.75), (0.0, 1.1)):
         *locations, poses, conditions = drive(sunny, config, share=share)
         plain, adapted = (
-            np.mean([np.hypot(*(one.pose - pose)[:2]) for one, pose in zip(of, poses, strict=True)])
+            np.mean(
+                [
+                    np.hypot(*(location.pose - pose)[:2])
+                    for location, pose in zip(of, poses, strict=True)
+                ]
+            )
             for of in locations
         )
         assert adapted < most * plain

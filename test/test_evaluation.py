@@ -22,7 +22,7 @@ from sfa_localization.fusion.belief import DrivenPath
 from sfa_localization.fusion.health import health_of
 from sfa_localization.place_model import PlaceModel
 
-TRUSTED = DrivenPath(placed_m=-math.inf)
+TRUSTED = DrivenPath(placed_m=(-math.inf,))
 
 
 @pytest.fixture(scope='module')

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filter as shipped errs as it says: chi-square tests over many robots, each drawn anew.
 
-Every robot has a wheel scale and a gyro bias of its own, slips, reads its speed with errors that
+Every robot has a wheel scale and a gyro bias of its white, slips, reads its speed with errors that
 last, and takes images whose errors correlate as its model states.
 """
 
@@ -103,8 +103,8 @@ class Robot:
         common, seen = rng.standard_normal(3), []
         for pose, fade in zip(poses, fades, strict=True):
             common = fade * common + math.sqrt(1 - fade**2) * rng.standard_normal(3)
-            own = math.sqrt(1 - error.share) * rng.standard_normal(3)
-            seen.append(pose + PICTURE_STD * (math.sqrt(error.share) * common + own))
+            white = math.sqrt(1 - error.share) * rng.standard_normal(3)
+            seen.append(pose + PICTURE_STD * (math.sqrt(error.share) * common + white))
         return np.array(seen)
 
 
@@ -156,10 +156,10 @@ def test_the_filter_as_shipped_errs_as_it_says(name):
     world, nees, total, freedom, refused = WORLDS[name], [], 0.0, 0, []
     for seed in range(SEEDS):
         fused = PoseFilter(SHIPPED, world.error)
-        found = judged(world, Robot(world, seed), fused)
-        nees.append(found[0])
-        total, freedom = total + found[1], freedom + found[2]
-        refused.append(found[3])
+        result = judged(world, Robot(world, seed), fused)
+        nees.append(result[0])
+        total, freedom = total + result[1], freedom + result[2]
+        refused.append(result[3])
     # At each of the three times, robots are independent of each other: their sum is chi-square.
     low, high = chi2.ppf([0.0005, 0.9995], 3 * SEEDS)
     assert np.all((low < np.sum(nees, 0)) & (np.sum(nees, 0) < high))

@@ -140,16 +140,16 @@ def test_a_long_pause_of_the_recording_is_survived_and_reported():
     assert fused.state.position_std > 10 * sure and fused.status.level is Level.LOST
 
 
-@pytest.mark.parametrize('apart_s', [-1e9, -7, 100])
-def test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed(apart_s):
+@pytest.mark.parametrize('ahead_s', [-1e9, -7, 100])
+def test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed(ahead_s):
     drive, fused = Drive(seconds=8), started()
     for stamp_ns, kind, index in drive.events():
-        drive.give(fused, (stamp_ns + kind * int(apart_s * SECOND), kind, index))
+        drive.give(fused, (stamp_ns + kind * int(ahead_s * SECOND), kind, index))
     assert fused.counts['reset'] == fused.counts['clock went back'] == 0
     assert fused.counts['odometry: used'] == len(drive.stamps_ns)
     assert drive.error(fused, -1)[0] < 0.1 and fused.status.level is Level.DEGRADED
-    where = 'behind' if apart_s < 0 else 'ahead of'
-    said = f'images are stamped {abs(apart_s):.0f} s {where} the odometry'
+    where = 'behind' if ahead_s < 0 else 'ahead of'
+    said = f'images are stamped {abs(ahead_s):.0f} s {where} the odometry'
     assert any(said in reason for reason in fused.status.reasons)
     # Once the clocks agree, all is forgotten.
     fused.add_measurement(int(drive.stamps_ns[-1]) + 1, drive.poses[-1, :2], np.eye(2) * 1e-2)

@@ -61,13 +61,13 @@ class ErrorCorrelation:
         images are compared inside one segment. Outliers are limited. With too few images the
         defaults.
         """
-        apart, product = _pairs(_standardized(errors, variances), driven_m, owner)
-        if len(apart) < _ENOUGH_PAIRS:
+        spacing, product = _pairs(_standardized(errors, variances), driven_m, owner)
+        if len(spacing) < _ENOUGH_PAIRS:
             return cls()
-        at = np.digitize(apart, _BINS_M)
+        at = np.digitize(spacing, _BINS_M)
         count = np.bincount(at, minlength=len(_BINS_M) + 1)
         filled = np.flatnonzero(count)
-        distance = np.bincount(at, apart)[filled] / count[filled]
+        distance = np.bincount(at, spacing)[filled] / count[filled]
         correlation = np.bincount(at, product)[filled] / count[filled]
         return cls(*_exponential(distance, correlation, count[filled].astype(float)))
 
@@ -77,10 +77,10 @@ class ErrorCorrelation:
         order = np.argsort(driven_m, kind='stable')
         path, total = driven_m[order], np.ones(len(driven_m))
         for lag in range(1, len(path)):
-            apart = path[lag:] - path[:-lag]
-            if apart.min() > _FARTHEST_M:
+            spacing = path[lag:] - path[:-lag]
+            if spacing.min() > _FARTHEST_M:
                 break
-            correlation = self.share * np.exp(-apart / self.distance_m)
+            correlation = self.share * np.exp(-spacing / self.distance_m)
             total[lag:] += correlation
             total[:-lag] += correlation
         return np.asarray(total[np.argsort(order)])
@@ -97,15 +97,15 @@ def _standardized(errors: Array, variances: Array) -> Array:
 
 def _pairs(ratio: Array, driven_m: Array, owner: NDArray[np.int64]) -> tuple[Array, Array]:
     """Distance and mean product of all pairs inside a segment and nearer than _FARTHEST_M."""
-    apart, product = [np.zeros(0)], [np.zeros(0)]
+    spacing, product = [np.zeros(0)], [np.zeros(0)]
     for lag in range(1, len(ratio)):
         distance = driven_m[lag:] - driven_m[:-lag]
         near = (owner[lag:] == owner[:-lag]) & (distance < _FARTHEST_M)
         if not near.any():
             break
-        apart.append(distance[near])
+        spacing.append(distance[near])
         product.append((ratio[lag:][near] * ratio[:-lag][near]).mean(1))
-    return np.concatenate(apart), np.concatenate(product)
+    return np.concatenate(spacing), np.concatenate(product)
 
 
 def _exponential(distance: Array, correlation: Array, weight: Array) -> tuple[float, float]:

@@ -19,11 +19,9 @@ Pose = tuple[float, float, float]
 """x m, y m, yaw rad."""
 Knot = tuple[int, float, float, float]
 """Stamp ns, x m, y m, yaw rad by dead reckoning."""
-SPACING_M, SPACING_RAD = 0.5, 0.2
-"""An image that shows less motion than this shows nothing new: neighboring images err alike."""
-LATEST, CAPACITY = 30, 60
-"""All of the LATEST images are kept, of older ones those that show something new, CAPACITY in all.
-"""
+SPACING_M, SPACING_RAD, LATEST, CAPACITY = 0.5, 0.2, 30, 60
+"""An image that shows less motion than this is not new: neighboring images err alike. All of the
+LATEST images are kept, of older ones those that are new, CAPACITY in all."""
 REACH_M, REACH_STDS = 12.0, 30.0
 """Images farther behind, in m and in standard deviations of the newest, are forgotten: there the
 odometry has drifted."""
@@ -32,6 +30,7 @@ LONGEST_DELAY_S = 10.0
 ODOMETRY_DRIFT = 0.05
 """Allowed error of odometry per meter, m and rad: the 5 % of a poor robot."""
 _KNOT_NS = 100_000_000
+_FORGIVEN_M = 30.0  # an estimate that was right for so long was not moved for nothing
 ENOUGH_IMAGES = 5
 """Images in a row that overrule an established estimate: half a second to a second of a camera."""
 DOUBT_STDS = 2.0
@@ -166,12 +165,12 @@ class Columns:
 
 
 class DrivenPath(NamedTuple):
-    """The path by its `knots`, and the distance traveled at the first of the images that placed the
-    filter last, `placed_m`.
+    """The path by its `knots`, and the distances traveled, `placed_m`, where images placed the
+    filter: at the start, and anew.
     """
 
     knots: tuple[Knot, ...] = ()
-    placed_m: float = math.inf
+    placed_m: tuple[float, ...] = (math.inf,)
 
     def driven(self, stamp_ns: int, pose: Pose, oldest_ns: int) -> DrivenPath:
         """With the pose that dead reckoning leads to; what is older than `oldest_ns` goes."""
@@ -185,6 +184,12 @@ class DrivenPath(NamedTuple):
         while first + 1 < len(knots) and knots[first + 1][0] <= oldest_ns:
             first += 1
         return self._replace(knots=(*knots[first:], knot))
+
+    def placed(self, traveled_m: float) -> DrivenPath:
+        """After images placed the filter anew, here."""
+        start_m, *anew_m = self.placed_m
+        recent_m = (before for before in anew_m if traveled_m - before < _FORGIVEN_M)
+        return self._replace(placed_m=(start_m, *recent_m, traveled_m))
 
 
 class Memory(NamedTuple):

@@ -108,7 +108,7 @@ class Ekf:
         belief = self.coast(belief, event.stamp_ns)
         if isinstance(event, PoseEvent):
             placed = _at_pose(belief, event.pose, event.covariance, 0.0)
-            path = belief.path._replace(placed_m=-math.inf)
+            path = belief.path._replace(placed_m=(-math.inf,))
             return placed._replace(memory=Memory(), path=path)
         return self._measured(with_delay(belief, event.late), event)
 
@@ -254,7 +254,8 @@ class Ekf:
         distance_m: float = 0.0,
     ) -> Belief:
         """At the pose that images over a distance show, or at the event's."""
-        path = belief.path._replace(placed_m=belief.traveled_m - distance_m)
+        since_m, path = belief.traveled_m - distance_m, belief.path
+        path = path.placed(since_m) if reason == ELSEWHERE else path._replace(placed_m=(since_m,))
         update = Update(event.stamp_ns, True, math.nan, math.nan, reason)
         memory = Memory(support=1, accepted_ns=event.stamp_ns, update=update)
         placed = _at_pose(belief, pose, covariance, self._correlation.share)

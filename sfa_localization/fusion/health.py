@@ -47,6 +47,8 @@ CAUTION, FLOOR_M, FLOOR_RAD, YAW_DRIFT = 4.0, 0.05, 0.02, 0.02
 one place share; heading error of the odometry, rad per m."""
 DELAYS: Array = np.r_[-1.5:-0.2:0.3, 0.3, 0.6 : LONGEST_DELAY_S + 0.1 : 0.4]
 """Delays s that are told apart, beside those that the camera's clock compensates."""
+LONGEST_M = 16.0
+"""An estimate that was placed anew again and again is confirmed over this distance at most."""
 _ANYWHERE = 1 / (100.0 * 2 * math.pi)
 """Density of poses anywhere in 100 m^2, 1/(m^2 rad)."""
 _TINY = 1e-9  # least weight of an image, so that some path fits best
@@ -58,20 +60,21 @@ _AHEAD_S = 0.3  # of the path: odometry may be a little behind
 class Health(NamedTuple):
     """The probability that all is `well`, and the likeliest fault with its size.
 
-    `confirmed_m` were driven since the estimate was placed, of the AGREEING_M that are needed.
+    `confirmed_m` of `needed_m` were driven since the estimate was placed.
     """
 
     well: float
     fault: str
     size: complex
     confirmed_m: float
+    needed_m: float
 
     @property
     def problems(self) -> list[str]:
         """Why the estimate is not trusted, in words."""
         problems = [] if self.well >= LIKELY else [_sentence(self.fault, self.size)]
-        if self.confirmed_m < AGREEING_M:
-            so_far = f'{self.confirmed_m:.1f} of {AGREEING_M:.0f} m'
+        if self.confirmed_m < self.needed_m:
+            so_far = f'{self.confirmed_m:.1f} of {self.needed_m:.0f} m'
             problems.append(f'placed, confirmed over {so_far}: driving on confirms it')
         return problems
 
@@ -95,17 +98,19 @@ def _sentence(fault: str, size: complex) -> str:
 
 def health_of(path: DrivenPath, fixes: Sequence[PositionFix]) -> Health:
     """The health by images beside a path."""
-    confirmed_m = max((fixes[-1].traveled_m if fixes else 0.0) - path.placed_m, 0.0)
+    confirmed_m = max((fixes[-1].traveled_m if fixes else 0.0) - path.placed_m[-1], 0.0)
+    # Each time that images which agree over as many meters place it anew doubles them.
+    needed_m = min(AGREEING_M * 2.0 ** max(len(path.placed_m) - 2, 0), LONGEST_M)
     new = [fix for fix in fixes if fix.is_new]
     if len(new) <= 3:  # so few always lie on some path
-        return Health(1.0, '', 0j, confirmed_m)
+        return Health(1.0, '', 0j, confirmed_m, needed_m)
     hypotheses = _Window(path, new).hypotheses()
     largest = max(each.log_odds for each in hypotheses)
     odds = np.exp([each.log_odds - largest for each in hypotheses])
     odds = np.where([each.is_harmful for each in hypotheses], odds, 0.0) / odds.sum()
     worst = hypotheses[int(np.argmax(odds))]
     well = 1 - float(odds.sum())
-    return Health(well, worst.name, complex(worst.size), confirmed_m)
+    return Health(well, worst.name, complex(worst.size), confirmed_m, needed_m)
 
 
 class _Hypothesis(NamedTuple):

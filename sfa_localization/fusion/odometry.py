@@ -16,18 +16,13 @@ from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import Belief, Jump, Odometer, OdometryEvent, Pose
 from sfa_localization.fusion.motion import Twist
 
-ODOMETRY_TIMEOUT_S = 0.5
-"""Odometry silent for longer is a gap: many times the period of any odometry."""
-COAST_S = 2.0
-"""Silence for which the last speed is assumed to go on: about how long robots keep a speed."""
-_LEARNING, _LEAST_NOISE = 0.1, 1e-3
-"""Relative change per message of the usual noise of steps, learned over about twenty; m or rad."""
-_LONGEST_S = math.pi / motion.UNKNOWN_RATE
-"""After a longer silence a robot may be headed anywhere, so that no step is impossible."""
-_JUMP = 0.05
-"""More motion than twice that of the speed, and this, m or rad, took longer than stamps say."""
-_ROUNDED_M = 2e-3
-"""A pose moves less than this sideways by its rounding."""
+ODOMETRY_TIMEOUT_S, COAST_S = 0.5, 2.0
+"""Odometry silent for longer is a gap: many times the period of any odometry. The last speed is
+assumed to go on for 2 s: about how long robots keep a speed."""
+_LEARNING, _LEAST_NOISE = 0.1, 1e-3  # relative change per message of the steps' noise; m or rad
+_LONGEST_S = math.pi / motion.UNKNOWN_RATE  # of a silence after which any heading is possible
+_JUMP = 0.05  # m or rad: motion beyond twice the speed by more took longer than stamps say
+_ROUNDED_M = 2e-3  # a pose moves less sideways by its rounding
 
 
 def repeats(belief: Belief, event: OdometryEvent) -> bool:

@@ -35,10 +35,9 @@ _TINY = 1e-12  # keeps the variance finite where a lone position shows no turn
 
 
 class Relocation(NamedTuple):
-    """Where agreeing images put the robot now: pose (3,), covariance (3, 3).
-
-    Over the same distance, `contradicting` counts what the filter accepted, `dissenting` what it
-    rejected but does not agree either. `have_yaw`: images show headings.
+    """Where agreeing images put the robot now: pose (3,), covariance (3, 3). `have_yaw`: they show
+    headings. Over the same distance, `contradicting` counts those that the filter accepted,
+    `dissenting` others that it rejected.
     """
 
     pose: Array
