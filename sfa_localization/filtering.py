@@ -152,7 +152,7 @@ def run_filter(
 
 
 class _Position(NamedTuple):
-    """A position (2,) or pose (3,) with its covariance; it shows no turns."""
+    """A position (2,) or pose (3,) with its covariance; logs hold no turns of images."""
 
     pose: Array
     covariance: Array

@@ -36,9 +36,9 @@ from sfa_localization.training import Recipe
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """The grid: factors on the variances of images and of odometry."""
 TUNED = ('measurement_factor', 'odometry_factor', 'slip_per_meter', 'yaw_per_radian')
-"""What the likelihood decides, each on a logarithmic scale."""
+"""The parameters that the likelihood decides, each on a logarithmic scale."""
 MIN_IMAGES = 20
-"""With fewer images, chance decides between the settings."""
+"""Fewer images do not tell the settings apart."""
 TRIALS = 120
 """Settings to try by likelihood."""
 _LEAST = 1e-9  # stands for a parameter of zero, which has no logarithm
@@ -48,10 +48,10 @@ _PULL = 1e-3  # cost per squared logarithm: holds what the data do not determine
 
 @dataclass(frozen=True, slots=True)
 class TuningDrive:
-    """One drive: odometry, and what the model makes of all images, the unusable ones too.
+    """A drive: odometry, and the observations of all images, also of unusable ones.
 
-    `truth` is for the grid search only; `filter_for` makes the filter that begins with what the
-    training learned of the robot.
+    `truth` is for the grid search only; `filter_for` makes a filter that begins with the model's
+    rig.
     """
 
     odometry: Odometry
@@ -118,8 +118,8 @@ def tune_by_grid(drives: Sequence[TuningDrive], config: FilterConfig) -> FilterC
 def likelihood_cost(drives: Sequence[TuningDrive], config: FilterConfig) -> float:
     """Negative log-likelihood per innovation component, under Student's distribution.
 
-    Its tails let the gate's outliers count without ruling; under a Gaussian cut at the gate the
-    best filter would be one that rejects everything.
+    Its tails limit the weight of rejected images; under a Gaussian cut at the gate, the best filter
+    would reject everything.
     """
     fused = [(drive, drive.filter_for(config)) for drive in drives]
     updates = [update for drive, of_drive in fused for _, update, _ in drive.fuse(of_drive)]

@@ -1,8 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Drives for the filter's tests: a true path, odometry and pictures with known errors; and filters
-to give them to.
-"""
+"""Simulated drives for the filter's tests: a true path, odometry and images with given errors."""
 
 import math
 from dataclasses import dataclass, field
@@ -62,8 +60,8 @@ def from_rest(twists, rate_hz=50.0, standing_s=0.6, faster_s=0.4):
 
 @dataclass
 class Drive:
-    """A drive to be fed to a filter: odometry in order, pictures every `every` samples; they claim
-    a standard deviation of `claimed_m` and a tenth of it, or that which they have.
+    """A drive to be fed to a filter: odometry in order, an image every `every` samples with the
+    covariance of its errors, or of `claimed_m`.
     """
 
     seconds: float = 30.0

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The posterior over what may be the matter, on images whose errors are known."""
+"""The posterior of what may be wrong, on images with simulated errors."""
 
 import cmath
 import math
@@ -67,7 +67,7 @@ def drive(
     return track, images
 
 
-@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('turn', [0.0, 0.5])
 @pytest.mark.parametrize('heading', [True, False])
 def test_where_all_is_well_two_meters_are_enough(heading, turn, seed):
@@ -89,7 +89,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('name', FAULTS)
 def test_each_fault_is_found_with_its_size_and_named(name, seed):
     camera, fault, size, said = FAULTS[name]
@@ -99,7 +99,7 @@ def test_each_fault_is_found_with_its_size_and_named(name, seed):
     assert said in health.problems[0] and len(health.problems) == 1
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('camera', [
     shows(late_s=0.2), shows(late_s=-0.2), shows(lever=0.25 + 0j), shows(lever=0.25j),
     shows(turned=math.radians(6)), shows(scale=0.9), shows(scale=1.1),

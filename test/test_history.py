@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The history: any order of arrival gives the same belief; what is too old is known as such."""
+"""The history: any order of arrival gives the same belief; what is too old is refused."""
 
 import itertools
 

@@ -59,7 +59,7 @@ def jumped(poses, at, way_m, turn_rad=0.0):
 
 @pytest.mark.parametrize('with_twist', [True, False])
 @pytest.mark.parametrize(('way_m', 'turn_rad'), [
-    (0.3, 0.0), (0.38, 0.0), (0.6, 0.0), (2.0, 0.0), (-0.5, 0.0), (0.0, 0.3), (0.3, 1.0),
+    (0.3, 0.0), (2.0, 0.0), (-0.5, 0.0), (0.0, 0.3), (0.3, 1.0),
 ])  # fmt: skip
 def test_odometry_that_jumps_moves_nothing_and_is_told_until_an_image_comes(
     way_m, turn_rad, with_twist
@@ -91,7 +91,7 @@ def test_noisy_poses_are_no_jumps_once_their_noise_is_learned():
     assert not any('jumped' in ' '.join(why) for t, *_, why in outputs if t > 4)
 
 
-@pytest.mark.parametrize('times', [2, 5, 12])
+@pytest.mark.parametrize('times', [2, 12])
 @pytest.mark.parametrize('twist', ['fresh', 'stale', 'zero'])
 def test_a_pose_that_is_repeated_adds_nothing(times, twist):
     rate_hz = 25
@@ -114,7 +114,7 @@ def test_poses_that_are_never_filled_and_a_robot_that_stands_go_on_by_the_twist(
     assert not any('no odometry' in reason for *_, why in outputs for reason in why)
 
 
-@pytest.mark.parametrize('ahead_s', [0.6, 1.0, 4.0, 30.0])
+@pytest.mark.parametrize('ahead_s', [0.6, 4.0, 30.0])
 @pytest.mark.parametrize('kind', [0, 1])
 def test_a_single_stamp_ahead_is_left_out_and_blocks_nothing(ahead_s, kind):
     drive, errors = Drive(seconds=10, omega_std=0.01), []
@@ -140,7 +140,7 @@ def test_a_clock_that_is_set_ahead_is_followed_from_the_third_message_on():
     assert drive.error(fused, -1)[0] < 0.1
 
 
-@pytest.mark.parametrize('late_s', [-0.2, 0.1, 0.3])
+@pytest.mark.parametrize('late_s', [-0.2, 0.3])
 def test_a_delay_other_than_expected_is_estimated_from_the_first_turn(late_s):
     """No visual turns are given: the images' poses show it, against the motion by the wheels."""
     drive = Drive(seconds=20, rate_hz=50)

@@ -92,8 +92,8 @@ def test_shuffled_and_late_messages_give_what_messages_in_time_give(heading, lat
 def test_no_decision_hangs_on_a_microsecond_and_another_start_of_time_changes_no_bit(
     later_ns, moved_m, decided
 ):
-    drive, runs = Drive(seconds=40, **NOISY), []
-    drive.kidnap(200, (4.0, 1.0, 0.5))
+    drive, runs = Drive(seconds=25, **NOISY), []
+    drive.kidnap(120, (4.0, 1.0, 0.5))
     for shift in (lambda kind: 0, later_ns):
         fused, poses, reasons = PoseFilter(), [], []
         for stamp_ns, kind, index in drive.events():
@@ -201,7 +201,7 @@ def test_standing_still_neither_drifts_nor_becomes_overconfident():
     before = fused.state
     stamp, wrong = int(drive.stamps_ns[-1]), drive.seen[-1] + [0.15, -0.15, 0.02]
     fused.add_odometry(stamp + SECOND // 10, 0.0, 0.0, (4e-4, 1e-4))
-    for k in range(1, 3600):
+    for k in range(1, 1200):
         fused.add_odometry(stamp + k * SECOND, 0.0, 0.0, (4e-4, 1e-4))
         seen = wrong + 0.02 * rng.standard_normal(3)
         fused.add_measurement(stamp + k * SECOND + 1, seen, np.diag([0.04, 0.04, 0.0025]))
@@ -213,14 +213,12 @@ def test_standing_still_neither_drifts_nor_becomes_overconfident():
 
 def test_covariance_stays_symmetric_positive_over_a_long_run():
     drive, fused = Drive(seconds=120, rate_hz=20, every=4, **NOISY), started()
-    for lap in range(3):
-        for stamp_ns, kind, index in drive.events():
-            drive.give(fused, (stamp_ns + lap * 120 * SECOND, kind, index), True)
-            if index % 500 == 0:
-                covariance = fused.state.covariance
-                assert np.array_equal(covariance, covariance.T)
-                assert np.linalg.eigvalsh(covariance)[0] > 0
-    assert fused.counts['odometry: used'] == 3 * len(drive.stamps_ns)
+    for event in drive.events():
+        drive.give(fused, event, True)
+        if event[2] % 100 == 0:
+            covariance = fused.state.covariance
+            assert np.array_equal(covariance, covariance.T)
+            assert np.linalg.eigvalsh(covariance)[0] > 0
 
 
 def test_bias_and_scale_are_learnt():
@@ -237,6 +235,18 @@ def test_it_beats_images_and_odometry():
     drive.feed(blind, pictures=False)
     alone = np.hypot(*(drive.seen[:, :2] - drive.poses[drive.pictures, :2]).T)
     assert np.mean(errors) < 0.7 * alone.mean() and errors[-1] < drive.error(blind, -1)[0]
+
+
+def test_stretches_of_images_that_lie_off_pull_less():
+    """Errors of images have heavy tails; with all their weight they would make 0.060 m."""
+    errors = []
+    for seed in range(4):
+        drive = Drive(seconds=60, position_std=0.15, seed=seed)
+        rng = np.random.default_rng(seed)
+        for start in rng.choice(len(drive.seen) - 10, 12, replace=False):
+            drive.seen[start : start + 10, :2] += rng.normal(0, 0.4, 2)
+        errors += [error for _, _, error, _ in drive.feed(PoseFilter(), True)]
+    assert np.mean(errors) < 0.058
 
 
 @pytest.mark.parametrize(('share', 'length_m'), [(0.3, LEAST_M), (0.7, 1e6)])
@@ -317,8 +327,8 @@ def test_one_picture_with_heading_starts_at_once_and_one_that_is_wrong_is_outvot
     assert outcomes[0][1].accepted and not outcomes[1][1].accepted and outcomes[3][2] < 0.8
 
 
-@pytest.mark.parametrize('seed', range(10))
-def test_without_heading_the_first_metres_start_it(seed):
+@pytest.mark.parametrize('seed', range(3))
+def test_without_heading_the_first_meters_start_it(seed):
     drive = Drive(seconds=8, start=(4.0, -3.0, 2.0 + seed), **NOISY, seed=seed)
     outcomes = drive.feed(PoseFilter())
     started = next(k for k, (_, update, _, _) in enumerate(outcomes) if update.accepted)
@@ -344,11 +354,10 @@ def test_an_uncertain_image_does_not_start_the_filter(stds):
     assert sure.accepted and fused.status.level is Level.DEGRADED
 
 
-@pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize(('heading', 'images'), [(True, 5), (False, 30)])
-def test_a_kidnapped_robot_knows_that_it_is_lost_and_recovers(heading, images, seed):
+def test_a_kidnapped_robot_knows_that_it_is_lost_and_recovers(heading, images):
     """After five images, or three meters where they have no heading."""
-    drive, fused = Drive(seconds=30, **NOISY, seed=seed), started()
+    drive, fused = Drive(seconds=30, **NOISY), started()
     drive.kidnap(150, (5.0, -4.0, 2.0))
     outcomes = drive.feed(fused, heading, stop=15.6)
     error, _ = drive.error(fused, np.searchsorted(drive.stamps_ns, fused.state.stamp_ns))

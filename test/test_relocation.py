@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where images that agree among themselves put the robot."""
+"""The pose by images that agree among themselves."""
 
 import math
 

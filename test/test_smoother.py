@@ -1,8 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Smoothing a drive: nearer to the truth than filtering; test_filter_consistency.py tests how sure
-it is.
-"""
+"""A smoothed drive is nearer to the truth; test_filter_consistency.py tests its covariances."""
 
 import numpy as np
 import pytest

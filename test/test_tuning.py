@@ -22,7 +22,7 @@ from sfa_localization.tuning import TuningDrive
 
 def tuning_drive(claimed=0.2, true=0.2, truth=True):
     """A drive whose images err by `true` m and claim a standard deviation of `claimed` m."""
-    drive = Drive(seconds=40, rate_hz=20, every=4, v_std=0.02, omega_std=0.01,
+    drive = Drive(seconds=20, rate_hz=20, every=4, v_std=0.02, omega_std=0.01,
                   position_std=true, yaw_std=0.05, share=0.7)  # fmt: skip
     variances = np.tile([4e-4, 1e-4], (len(drive.stamps_ns), 1))
     spread = np.diag([claimed**2, claimed**2, 0.05**2])
@@ -51,7 +51,7 @@ def test_the_likelihood_is_best_near_the_true_noise():
 
 
 def test_the_search_by_likelihood_needs_no_truth_and_stays_in_the_ranges(monkeypatch):
-    monkeypatch.setattr(tuning, 'TRIALS', 40)
+    monkeypatch.setattr(tuning, 'TRIALS', 20)
     drives = [tuning_drive(claimed=0.1, true=0.4, truth=False)]
     best = tuning.tune_by_likelihood(drives, FilterConfig())
     before, after = (tuning.likelihood_cost(drives, trial) for trial in (FilterConfig(), best))
@@ -97,12 +97,8 @@ def test_images_that_are_stamped_late_are_no_noise_and_unusable_ones_do_not_coun
     # Without turns the filter learns the delay from the way alone, later.
     assert costs[1] == pytest.approx(costs[0]) and costs[1] < costs[2] < costs[3]
     assert errors[1] < 1.2 * errors[0] and errors[2] < 0.5 * errors[3], errors
-    dark = [
-        replace(
-            image, problem='dark', covariance=unusable_covariance(), stamp_ns=image.stamp_ns + 1
-        )
-        for image in plain.observations
-    ]
+    unusable = {'problem': 'dark', 'covariance': unusable_covariance()}
+    dark = [replace(image, **unusable, stamp_ns=image.stamp_ns + 1) for image in plain.observations]
     images = sorted([*plain.observations, *dark], key=lambda image: image.stamp_ns)
     with_dark = replace(plain, observations=images)
     for cost in (tuning.likelihood_cost, tuning.error_cost):

@@ -39,8 +39,11 @@ from sfa_localization.fusion.status import DEGRADED_YAW_RAD
 STARTED, ELSEWHERE = STARTS = 'started', 'restarted elsewhere'
 """Reasons of updates that take a pose from measurements alone."""
 GATE = {2: 13.815510557964274, 3: 16.26623619623813}
-"""Squared distances, by dimensions, beyond which measurements are rejected: one right one in a
-thousand (chi-square)."""
+OUTLYING = {2: 3.2188758248682006, 3: 4.641627676087445}
+"""Squared distances, by dimensions, that one right measurement in a thousand, and in five, exceeds
+(chi-square). Those beyond the first are rejected, those beyond the second lose weight."""
+ALIKE_SHARE = 0.2
+"""Where neighbors share less of their errors, positions are those of a sensor without outliers."""
 
 
 class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
@@ -211,8 +214,8 @@ class Ekf:
     def _gated(
         self, belief: Belief, event: MeasurementEvent, images: tuple[PositionFix, ...]
     ) -> Belief:
-        """Accept what lies inside the gate; reject what lies outside, or restart where the rejected
-        images outweigh the estimate.
+        """Accept what lies inside the gate, with less weight where it is outlying; reject what lies
+        outside, or restart where the rejected images outweigh the estimate.
         """
         kalman, memory, size = self._kalman, belief.memory, event.value.size
         z, jacobian, white = self._linearized(belief, event)
@@ -227,6 +230,9 @@ class Ekf:
                 return self._restarted(belief, event, ELSEWHERE, *pose)
             rejected = memory._replace(rejected=memory.rejected + 1, images=images, update=update)
             return belief._replace(memory=rejected)
+        outlying = d2 / OUTLYING[size]
+        if outlying > 1 and self._correlation.share >= ALIKE_SHARE:
+            mean, covariance, _ = kalman.corrected(belief, z, jacobian, white * outlying**2)
         images = (*images[:-1], images[-1]._replace(accepted=True))
         memory = Memory(memory.support + 1, 0, event.stamp_ns, images, update)
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
