@@ -143,8 +143,9 @@ WORLDS = {
 SEEDS = 20
 
 
-def test_the_gate_is_the_quantile_of_squared_distances():
-    assert pytest.approx({size: chi2.ppf(0.999, size) for size in (2, 3)}) == ekf.GATE
+def test_limits_are_quantiles_of_squared_distances():
+    for limits, share in ((ekf.GATE, 0.999), (ekf.OUTLYING, 0.8)):
+        assert limits == pytest.approx({size: chi2.ppf(share, size) for size in (2, 3)})
 
 
 @pytest.mark.parametrize('name', WORLDS)

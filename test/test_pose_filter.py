@@ -306,15 +306,6 @@ def test_a_cluster_of_wrong_images_after_an_outage_is_not_trusted_at_once(outage
 # Start and recovery.
 
 
-def test_the_image_after_the_first_repeats_a_share_of_its_error():
-    fused, spread = PoseFilter(correlation=ErrorCorrelation(0.7, 1.0)), np.diag([0.04, 0.04, 0.01])
-    for k in range(2):
-        fused.add_odometry(START_NS + 2 * k, 0.0, 0.0, (1e-9, 1e-9))
-        update = fused.add_measurement(START_NS + 2 * k + 1, np.zeros(3), spread)
-    # Of two images in one place, errors (1 - share) apart.
-    assert np.allclose(update.covariance, 2 * (1 - 0.7) * spread, rtol=0.05)
-
-
 def test_one_picture_with_heading_starts_at_once_and_one_that_is_wrong_is_outvoted():
     drive, fused = Drive(seconds=5, start=(4.0, -3.0, 2.0), **NOISY), PoseFilter()
     assert fused.state is None and fused.status.level is Level.UNINITIALISED
@@ -334,15 +325,6 @@ def test_without_heading_the_first_meters_start_it(seed):
     started = next(k for k, (_, update, _, _) in enumerate(outcomes) if update.accepted)
     assert drive.pictures[started] / 50 < 3.0
     assert abs(outcomes[-1][3]) < 0.3 and outcomes[-1][2] < 0.8
-
-
-def test_positions_without_motion_show_no_heading():
-    fused = PoseFilter()
-    for stamp_ns in range(START_NS, START_NS + 2 * SECOND, SECOND // 50):
-        fused.add_odometry(stamp_ns, 0.0, 0.0)
-        update = fused.add_measurement(stamp_ns, [1.0, 2.0], 0.04 * np.eye(2))
-    assert not update.accepted and fused.state is None
-    assert fused.status.reasons == ('images show no heading yet: drive on',)
 
 
 @pytest.mark.parametrize('stds', [(2.5, 0.1, 0.1), (0.1, 2.5, 0.1), (0.1, 0.1, 0.9)])

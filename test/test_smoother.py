@@ -31,15 +31,6 @@ def test_a_smoothed_drive_is_nearer_to_the_truth(heading):
     assert np.allclose(states[-1].covariance, live[-1].covariance)
 
 
-def test_a_robot_that_stands_was_always_where_it_is_found_in_the_end():
-    drive = Drive(twists=np.zeros((500, 2)), start=(3.0, -2.0, 2.9), position_std=0.2, yaw_std=0.05)
-    states = fed(Smoother(), drive).smoothed()
-    poses = np.array([state.pose for state in states])
-    assert np.abs(poses - poses[-1]).max() < 1e-3
-    stds = np.array([state.position_std for state in states])
-    assert np.allclose(stds, stds[-1], rtol=0.02)
-
-
 def test_nothing_reaches_back_beyond_a_kidnapping():
     drive = Drive(seconds=60, **NOISY)
     drive.kidnap(len(drive.pictures) // 2, (8.0, 5.0, 1.0))
