@@ -82,11 +82,6 @@ class CameraClockFinder:
         # turns their number, their size and their residuals.
         self._cost, self._power, self._turns, self._size, self._error = np.zeros((5, 2, len(_GRID)))
 
-    def expect(self, clock: CameraClock) -> None:
-        """Use this estimate before any other."""
-        self._start = clock
-        self._estimates[0] = 0, clock
-
     @property
     def clock(self) -> CameraClock:
         """The newest estimate."""

@@ -32,7 +32,7 @@ from sfa_localization.fusion.belief import (
 from sfa_localization.fusion.camera_clock import SIGNIFICANT_STDS
 from sfa_localization.fusion.motion import DELAY, ERROR, SIZE, YAW, MotionNoise, Step, Twist, V
 from sfa_localization.fusion.odometry import COAST_S, interval, jump, received, repeats
-from sfa_localization.fusion.relocation import relocate
+from sfa_localization.fusion.relocation import Relocation, relocate
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import DEGRADED_YAW_RAD
 
@@ -200,13 +200,13 @@ class Ekf:
         if event.value.size == 3:
             x, y, yaw = event.covariance.diagonal().tolist()
             if max(x, y) <= config.lost_std**2 and yaw <= config.lost_yaw_std**2:
-                return self._restarted(belief, event, STARTED, event.value, event.covariance)
+                start = Relocation(event.value, event.covariance, 1, 0.0, True)
+                return self._restarted(belief, event, STARTED, start)
             reason = 'too uncertain to start from'
         else:
             place = relocate(images, self._correlation.distance_m)
             if place is not None and place.shows_heading(len(images)):
-                pose = place.pose, place.covariance, place.distance_m
-                return self._restarted(belief, event, STARTED, *pose)
+                return self._restarted(belief, event, STARTED, place)
             reason = 'heading unknown yet'
         update = Update(event.stamp_ns, False, math.nan, math.nan, reason)
         return belief._replace(memory=belief.memory._replace(images=images, update=update))
@@ -226,8 +226,7 @@ class Ekf:
         if not inside:
             place = relocate(images, self._correlation.distance_m) if len(images) > 1 else None
             if place is not None and place.outweighs(belief):
-                pose = place.pose, place.covariance, place.distance_m
-                return self._restarted(belief, event, ELSEWHERE, *pose)
+                return self._restarted(belief, event, ELSEWHERE, place)
             rejected = memory._replace(rejected=memory.rejected + 1, images=images, update=update)
             return belief._replace(memory=rejected)
         outlying = d2 / OUTLYING[size]
@@ -251,20 +250,14 @@ class Ekf:
         return event.value - event.late.value * moving, jacobian, (1 - share) * event.covariance
 
     def _restarted(
-        self,
-        belief: Belief,
-        event: MeasurementEvent,
-        reason: str,
-        pose: Array,
-        covariance: Array,
-        distance_m: float = 0.0,
+        self, belief: Belief, event: MeasurementEvent, reason: str, place: Relocation
     ) -> Belief:
-        """At the pose that images over a distance show, or at the event's."""
-        since_m, path = belief.traveled_m - distance_m, belief.path
+        """The belief at the place that images show."""
+        since_m, path = belief.traveled_m - place.distance_m, belief.path
         path = path.placed(since_m) if reason == ELSEWHERE else path._replace(placed_m=(since_m,))
         update = Update(event.stamp_ns, True, math.nan, math.nan, reason)
         memory = Memory(support=1, accepted_ns=event.stamp_ns, update=update)
-        placed = _at_pose(belief, pose, covariance, self._correlation.share)
+        placed = _at_pose(belief, place.pose, place.covariance, self._correlation.share)
         # Images show where the robot was a delay ago.
         variance, by_delay = placed.covariance[DELAY, DELAY], np.zeros(SIZE)
         by_delay[:3], by_delay[DELAY] = motion.velocity(placed.mean), 1.0

@@ -31,7 +31,7 @@ from sfa_localization.fusion.belief import LONGEST_DELAY_S, Columns, DrivenPath,
 from sfa_localization.fusion.relocation import AGREEING_M
 
 LIKELY = 0.9
-"""Probability of nothing harmful from which the estimate is trusted."""
+"""Least probability of no harmful fault with which the estimate is trusted."""
 LATE_PRIOR, PRIOR = 2e-2, 5e-3
 """Prior probability of all delays together, and of each other fault, in any window: once in some
 hundred meters."""

@@ -112,10 +112,7 @@ class Step(NamedTuple):
 
 
 class MotionNoise(NamedTuple):
-    """How driving makes the state uncertain; see the parameters of these names.
-
-    `decorrelation_m` is the distance over which the error that images share fades.
-    """
+    """The parameters of these names, and the distance over which the errors of images fade."""
 
     slip_per_meter: float
     yaw_per_radian: float

@@ -214,7 +214,7 @@ class PoseFilter:
         delay_s = rig.camera_delay.value
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.is_estimated:
             self._expected_s = delay_s
-            self._camera.expect(CameraClock(delay_s, assumed=True))
+            self._camera = CameraClockFinder(_CLOCK_MEMORY, CameraClock(delay_s, assumed=True))
         belief, prior = self._history.newest, self._ekf.blank(0)
         # The pose of odometry jumps to the new scale: forget the one before.
         belief = belief._replace(odometry=belief.odometry._replace(pose=None))
