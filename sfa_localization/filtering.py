@@ -152,7 +152,7 @@ def run_filter(
 
 
 class _Position(NamedTuple):
-    """A position (2,) or pose (3,) with its covariance; it shows no turns."""
+    """A position (2,) or pose (3,) with its covariance; logs hold no turns of images."""
 
     pose: Array
     covariance: Array
@@ -162,12 +162,12 @@ class _Position(NamedTuple):
     def of(cls, row: Array) -> _Position:
         """From a row (7,); an empty or zero variance is unknown."""
         x, y, var_x, var_y, xy, yaw, var_yaw = np.nan_to_num(row).tolist()
-        known = bool(var_x or var_y)
-        covariance = np.array([[var_x or var_y, xy], [xy, var_y or var_x]]) * known
+        has_variance = bool(var_x or var_y)
+        covariance = np.array([[var_x or var_y, xy], [xy, var_y or var_x]]) * has_variance
         if not (var_yaw > 0 and math.isfinite(row[5])):
             return cls(np.array([x, y]), covariance)
         full = np.diag([POSITION_STD**2, POSITION_STD**2, var_yaw])
-        if known:
+        if has_variance:
             full[:2, :2] = covariance
         return cls(np.array([x, y, yaw]), full)
 
@@ -176,7 +176,8 @@ def write(filtered: Filtered, path: Path, beside: Path) -> None:
     """Write lines of `stamp x y z qx qy qz qw`, and beside them covariances. Raises DataError."""
     with atomic_write(path, DataError) as poses, atomic_write(beside, DataError) as spreads:
         spreads.write(b'stamp_s,var_x,cov_xy,cov_xyaw,var_y,cov_yyaw,var_yaw\n')
-        for stamp_ns, (x, y, yaw), matrix in zip(*filtered[:3], strict=True):
+        rows = zip(filtered.stamps_ns, filtered.poses, filtered.covariances, strict=True)
+        for stamp_ns, (x, y, yaw), matrix in rows:
             stamp = _seconds(int(stamp_ns))
             turn = f'{math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}'
             cells = ','.join(f'{cell:.9g}' for cell in matrix[np.triu_indices(3)])

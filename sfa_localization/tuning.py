@@ -36,9 +36,9 @@ from sfa_localization.training import Recipe
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """The grid: factors on the variances of images and of odometry."""
 TUNED = ('measurement_factor', 'odometry_factor', 'slip_per_meter', 'yaw_per_radian')
-"""What the likelihood decides, each on a logarithmic scale."""
+"""The parameters that the likelihood decides, each on a logarithmic scale."""
 MIN_IMAGES = 20
-"""With fewer images, chance decides between the settings."""
+"""Fewer images do not tell the settings apart."""
 TRIALS = 120
 """Settings to try by likelihood."""
 _LEAST = 1e-9  # stands for a parameter of zero, which has no logarithm
@@ -48,10 +48,10 @@ _PULL = 1e-3  # cost per squared logarithm: holds what the data do not determine
 
 @dataclass(frozen=True, slots=True)
 class TuningDrive:
-    """One drive: odometry, and what the model makes of all images, the unusable ones too.
+    """A drive: odometry, and the observations of all images, also of unusable ones.
 
-    `truth` is for the grid search only; `filter_for` makes the filter that begins with what the
-    training found of the robot.
+    `truth` is for the grid search only; `filter_for` makes a filter that begins with the model's
+    rig.
     """
 
     odometry: Odometry
@@ -73,7 +73,7 @@ def read_drive(
     """A bag's odometry, and the poses of its images by the model. Raises BagError, DataError."""
     live = as_live(recipe, model.panorama)
     run, observations = observed(bag, Observer(model, watch), live, True, want_truth)
-    usable = sum(not one.problem for one in observations)
+    usable = sum(not image.problem for image in observations)
     if usable < MIN_IMAGES:
         raise DataError(f'{bag}: {usable} images are too few to tune on: {MIN_IMAGES} at least')
     if want_truth and run.ground_truth is None:
@@ -101,10 +101,10 @@ def tune_by_likelihood(drives: Sequence[TuningDrive], config: FilterConfig) -> F
     simplex = np.vstack([start, start + _FIRST_STEP * np.eye(len(TUNED))])
     options = {'maxfev': TRIALS, 'initial_simplex': simplex, 'xatol': 0.05, 'fatol': 1e-3}
     with progress_bar('tune by likelihood', TRIALS, 'trials', shown=True) as bar:
-        found = minimize(cost, start, method='Nelder-Mead', options=options)
-    if not math.isfinite(found.fun):
+        best = minimize(cost, start, method='Nelder-Mead', options=options)
+    if not math.isfinite(best.fun):
         raise DataError('the filter fused nothing: give longer drives, of one clock')
-    return at(found.x)
+    return at(best.x)
 
 
 def tune_by_grid(drives: Sequence[TuningDrive], config: FilterConfig) -> FilterConfig:
@@ -118,12 +118,12 @@ def tune_by_grid(drives: Sequence[TuningDrive], config: FilterConfig) -> FilterC
 def likelihood_cost(drives: Sequence[TuningDrive], config: FilterConfig) -> float:
     """Negative log-likelihood per innovation component, under Student's distribution.
 
-    Its tails let the gate's outliers count without ruling; under a Gaussian cut at the gate the
-    best filter would be one that rejects everything.
+    Its tails limit the weight of rejected images; under a Gaussian cut at the gate, the best filter
+    would reject everything.
     """
     fused = [(drive, drive.filter_for(config)) for drive in drives]
     updates = [update for drive, of_drive in fused for _, update, _ in drive.fuse(of_drive)]
-    innovations = [(one.d2, one.covariance) for one in updates if one.covariance is not None]
+    innovations = [(u.d2, u.covariance) for u in updates if u.covariance is not None]
     total = sum(
         np.linalg.slogdet(spread)[1] / 2 + surprise(d2, len(spread)) for d2, spread in innovations
     )
@@ -141,8 +141,8 @@ def error_cost(drives: Sequence[TuningDrive], config: FilterConfig) -> float:
         stamps = np.array([image.stamp_ns for image in images])
         taken = drive.truth.at(stamps - fused.camera_clock.delay_ns)[:, :2]
         to_truth = align(np.array([image.position for image in images]), taken)
-        believed = np.array([np.full(3, np.nan) if one is None else one.pose for one in states])
-        apart = to_truth.apply(believed[:, :2]) - drive.truth.at(stamps)[:, :2]
-        errors.append(np.hypot(*apart[np.isfinite(apart[:, 0])].T))
+        believed = np.array([state.pose if state else np.full(3, np.nan) for state in states])
+        miss = to_truth.apply(believed[:, :2]) - drive.truth.at(stamps)[:, :2]
+        errors.append(np.hypot(*miss[np.isfinite(miss[:, 0])].T))
     every = np.concatenate(errors)
     return float(every.mean()) if len(every) else math.inf

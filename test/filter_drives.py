@@ -1,8 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Drives for the filter's tests: a true path, odometry and pictures with known errors; and filters
-to give them to.
-"""
+"""Simulated drives for the filter's tests: a true path, odometry and images with given errors."""
 
 import math
 from dataclasses import dataclass, field
@@ -20,7 +18,7 @@ NOISY = {
 }  # fmt: skip
 
 
-def known(pose=(0.0, 0.0, 0.0), std=0.05, **how):
+def started(pose=(0.0, 0.0, 0.0), std=0.05, **how):
     """A filter that was told where it starts."""
     fused = PoseFilter(**how)
     fused.set_pose(START_NS, pose, std**2 * np.eye(3))
@@ -62,8 +60,8 @@ def from_rest(twists, rate_hz=50.0, standing_s=0.6, faster_s=0.4):
 
 @dataclass
 class FilterDrive:
-    """A drive to be fed to a filter: odometry in order, pictures every `every` samples; they claim
-    a standard deviation of `claimed_m` and a tenth of it, or that which they have.
+    """A drive to be fed to a filter: odometry in order, an image every `every` samples with the
+    covariance of its errors, or of `claimed_m`.
     """
 
     seconds: float = 30.0
@@ -148,15 +146,15 @@ class FilterDrive:
 
     def feed(self, fused, heading=False, start=0, stop=None, pictures=True):
         """Feed seconds [start, stop); per picture: (index, update, error, yaw error)."""
-        found = []
+        outcomes = []
         for event in self.events():
             t = seconds_of(event)
             if t < start or (stop is not None and t >= stop) or (event[1] and not pictures):
                 continue
             update = self.give(fused, event, heading)
             if event[1]:
-                found.append((event[2], update, *self.error(fused, self.pictures[event[2]])))
-        return found
+                outcomes.append((event[2], update, *self.error(fused, self.pictures[event[2]])))
+        return outcomes
 
     def error(self, fused, sample):
         """Distance and heading error against the truth at a sample; NaN without a state."""

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The conditions of late: what the light adds to all images, and how wrong slow features are."""
+"""Recent conditions: what the light adds to all images, and how wrong slow features are."""
 
 from functools import cache
 
@@ -57,10 +57,8 @@ def test_what_the_light_adds_everywhere_moves_no_place(config):
     patterns = []
     for share, most in ((0.3, 0.75), (0.0, 1.1)):
         *locations, poses, conditions = drive(sunny, config, share=share)
-        plain, adapted = (
-            np.mean([np.hypot(*(one.pose - pose)[:2]) for one, pose in zip(of, poses, strict=True)])
-            for of in locations
-        )
+        positions = np.array([[each.pose[:2] for each in of] for of in locations])
+        plain, adapted = np.linalg.norm(positions - poses[:, :2], axis=2).mean(1)
         assert adapted < most * plain
         patterns.append(np.linalg.norm(conditions.pattern))
     assert patterns[1] < 0.2 * patterns[0]
@@ -71,7 +69,7 @@ def seen(x, residual, outward=0.2) -> Location:
 
 
 def test_the_pattern_is_a_mean_over_places():
-    """What is unusual about one place, as a visitor there, is none of the others' business."""
+    """What changed at a single place, as a visitor there, does not change the pattern."""
     share, rng, conditions = np.ones((3, 4)), np.random.default_rng(0), Conditions()
     conditions.add(seen(0.0, share))
     once = conditions.pattern.copy()
@@ -84,8 +82,8 @@ def test_the_pattern_is_a_mean_over_places():
     assert np.all(conditions.pattern.real > once.real)
     conditions = Conditions()
     for k in range(300):
-        known = 0.0 if conditions.pattern is None else conditions.pattern
-        conditions.add(seen(0.3 * k, share + rng.normal(0, 1.0, share.shape) - known))
+        pattern = 0.0 if conditions.pattern is None else conditions.pattern
+        conditions.add(seen(0.3 * k, share + rng.normal(0, 1.0, share.shape) - pattern))
     assert np.abs(conditions.pattern.mean() - 1) < 0.15
     assert np.std(conditions.pattern) < 0.3
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""How pictures' errors hang together: found again in errors that are made so."""
+"""How pictures' errors hang together: fitted again in errors that are made so."""
 
 import math
 
@@ -30,9 +30,9 @@ def made(share, distance, seed=0, step=0.1, stretches=60, length=80):
 
 @pytest.mark.parametrize(('share', 'distance'), [(0.3, 1.0), (0.7, 0.3), (0.9, 2.0)])
 def test_share_and_distance_are_found_again(share, distance):
-    found = [ErrorCorrelation.fit(*made(share, distance, seed)) for seed in range(5)]
-    assert np.mean([f.share for f in found]) == pytest.approx(share, abs=0.06)
-    assert np.median([f.distance_m for f in found]) == pytest.approx(distance, rel=0.3)
+    fitted = [ErrorCorrelation.fit(*made(share, distance, seed)) for seed in range(5)]
+    assert np.mean([f.share for f in fitted]) == pytest.approx(share, abs=0.06)
+    assert np.median([f.distance_m for f in fitted]) == pytest.approx(distance, rel=0.3)
 
 
 def test_white_errors_have_nothing_in_common_and_outliers_do_not_rule():
@@ -44,15 +44,15 @@ def test_white_errors_have_nothing_in_common_and_outliers_do_not_rule():
 
 def test_errors_of_different_stretches_are_not_compared_and_too_few_say_nothing():
     errors, variances, way, owner = made(0.8, 0.5, stretches=400, length=4)
-    apart = ErrorCorrelation.fit(errors, variances, way, owner)
+    separate = ErrorCorrelation.fit(errors, variances, way, owner)
     mixed = ErrorCorrelation.fit(errors, variances, way, np.zeros_like(owner))
-    assert apart.share == pytest.approx(0.8, abs=0.1) and mixed.distance_m < apart.distance_m
+    assert separate.share == pytest.approx(0.8, abs=0.1) and mixed.distance_m < separate.distance_m
     few = made(0.2, 1.0, stretches=3, length=5)
     assert ErrorCorrelation.fit(*few) == ErrorCorrelation()
 
 
 def test_errors_that_are_alike_count_as_fewer():
-    """By hand: 0.5 of errors fades to a half in 1 m; what is far apart has nothing in common."""
+    """By hand: 0.5 of errors fades to a half in 1 m; what is far separate has nothing in common."""
     correlation = ErrorCorrelation(0.5, 1.0 / math.log(2.0))
     alike = correlation.alike(np.array([1.0, 0.0, 100.0, 2.0]))
     np.testing.assert_allclose(alike, [1.5, 1.375, 1.0, 1.375])

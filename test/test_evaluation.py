@@ -18,11 +18,11 @@ from sfa_localization.config import write_config
 from sfa_localization.data.geometry import rotation
 from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion import pose_filter
+from sfa_localization.fusion.belief import DrivenPath
 from sfa_localization.fusion.health import health_of
-from sfa_localization.fusion.track import DrivenPath
 from sfa_localization.place_model import PlaceModel
 
-TRUSTED = DrivenPath(since_m=-math.inf)
+TRUSTED = DrivenPath(placed_m=(-math.inf,))
 
 
 @pytest.fixture(scope='module')

@@ -101,11 +101,11 @@ def test_the_command_writes_what_the_live_filter_would_have_said(tmp_path):
 
 def test_it_starts_from_a_pose_or_the_way_and_beats_the_positions(tmp_path):
     drive = FilterDrive(seconds=60, start=(500.0, -200.0, 2.5), **NOISY)
-    _, found = run(tmp_path, drive)
-    assert errors(drive, *found).mean() < 0.6 * alone(drive)
+    _, written = run(tmp_path, drive)
+    assert errors(drive, *written).mean() < 0.6 * alone(drive)
     drive = FilterDrive(seconds=10, start=(1.0, 2.0, -3.0), **NOISY)
-    _, found = run(tmp_path, drive, *at(tmp_path, 1.0, 2.0, -3.0))
-    assert len(found[0]) == len(drive.stamps_ns) and errors(drive, *found).max() < 0.6
+    _, written = run(tmp_path, drive, *at(tmp_path, 1.0, 2.0, -3.0))
+    assert len(written[0]) == len(drive.stamps_ns) and errors(drive, *written).max() < 0.6
 
 
 def test_headers_and_separators_of_all_kinds_read_alike_and_nanoseconds_survive(tmp_path):

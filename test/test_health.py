@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The posterior over what may be the matter, on images whose errors are known."""
+"""The posterior of what may be wrong, on images with simulated errors."""
 
 import cmath
 import math
@@ -12,8 +12,8 @@ from filter_drives import stamps, winding
 
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import integrate
+from sfa_localization.fusion.belief import DrivenPath, PositionFix, remembered
 from sfa_localization.fusion.health import LIKELY, health_of
-from sfa_localization.fusion.track import DrivenPath, PositionFix, remembered
 
 RATE_HZ, EVERY, STD_M, STD_RAD = 20, 10, 0.1, 0.03
 MAP = 30 - 10j, 2.0
@@ -23,14 +23,14 @@ MAP = 30 - 10j, 2.0
 def shows(late_s=0.0, lever=0j, turned=0.0, scale=1.0):
     """What an image shows at a sample of the path (N, 3): place in its frame, and yaw, or None."""
 
-    def shown(poses, i):
+    def camera(poses, i):
         at = max(i - round(late_s * RATE_HZ), 0)
         if at >= len(poses):
             return None
         x, y, yaw = poses[at]
         return scale * complex(x, y) + cmath.exp(1j * yaw) * lever, yaw + turned
 
-    return shown
+    return camera
 
 
 def anywhere(_, i):
@@ -39,7 +39,7 @@ def anywhere(_, i):
 
 
 def drive(
-    seconds=20.0, turn=0.5, shown=None, seed=0, heading=True, frame=(0j, 0.0), mapped=MAP,
+    seconds=20.0, turn=0.5, camera=None, seed=0, heading=True, frame=(0j, 0.0), mapped=MAP,
     std_m=STD_M,
 ):  # fmt: skip
     """The track, and what is remembered of images, after a drive at 1 m/s along a path that winds,
@@ -50,24 +50,24 @@ def drive(
     twists = winding(seconds, RATE_HZ, 1.0, turn)
     at_ns = stamps(len(twists), RATE_HZ).tolist()
     poses = integrate(np.array(at_ns), twists, np.zeros(3))
-    shown, rng, way_m = shown or shows(), np.random.default_rng(seed), 0.0
-    track, images = DrivenPath(since_m=0.0), ()
+    camera, rng, way_m = camera or shows(), np.random.default_rng(seed), 0.0
+    track, images = DrivenPath(placed_m=(0.0,)), ()
     for i, (x, y, yaw) in enumerate(poses.tolist()):
         at = frame[0] + cmath.exp(1j * frame[1]) * complex(x, y)
         reckoned = at.real, at.imag, float(wrap_angle(yaw + frame[1]))
         way_m += math.hypot(*(poses[i, :2] - poses[max(i - 1, 0), :2]))
         track = track.driven(at_ns[i], reckoned, images[0].stamp_ns if images else at_ns[i])
-        if i % EVERY == 0 and (found := shown(poses, i)):
-            place = mapped[0] + cmath.exp(1j * mapped[1]) * found[0]
+        if i % EVERY == 0 and (seen := camera(poses, i)):
+            place = mapped[0] + cmath.exp(1j * mapped[1]) * seen[0]
             place += std_m * complex(*rng.standard_normal(2))
-            look = float(wrap_angle(found[1] + mapped[1] + STD_RAD * rng.standard_normal()))
+            look = float(wrap_angle(seen[1] + mapped[1] + STD_RAD * rng.standard_normal()))
             look, variance = (look, STD_RAD**2) if heading else (math.nan, math.inf)
             image = PositionFix(at_ns[i], place, look, std_m**2, variance, reckoned, way_m)
             images = remembered(images, image)
     return track, images
 
 
-@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('turn', [0.0, 0.5])
 @pytest.mark.parametrize('heading', [True, False])
 def test_where_all_is_well_two_meters_are_enough(heading, turn, seed):
@@ -89,28 +89,28 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('name', FAULTS)
 def test_each_fault_is_found_with_its_size_and_named(name, seed):
-    shown, fault, size, said = FAULTS[name]
-    health = health_of(*drive(shown=shown, seed=seed))
+    camera, fault, size, said = FAULTS[name]
+    health = health_of(*drive(camera=camera, seed=seed))
     assert health.well < 1 - LIKELY
     assert health.fault == fault and abs(health.size - size) < 0.25 * max(abs(size), 1.0)
     assert said in health.problems[0] and len(health.problems) == 1
 
 
-@pytest.mark.parametrize('seed', range(3))
-@pytest.mark.parametrize('shown', [
+@pytest.mark.parametrize('seed', range(2))
+@pytest.mark.parametrize('camera', [
     shows(late_s=0.2), shows(late_s=-0.2), shows(lever=0.25 + 0j), shows(lever=0.25j),
     shows(turned=math.radians(6)), shows(scale=0.9), shows(scale=1.1),
 ])  # fmt: skip
-def test_what_moves_the_robot_by_little_is_no_fault(shown, seed):
-    health = health_of(*drive(shown=shown, seed=seed))
+def test_what_moves_the_robot_by_little_is_no_fault(camera, seed):
+    health = health_of(*drive(camera=camera, seed=seed))
     assert health.well > LIKELY and health.problems == []
 
 
 def test_a_quarter_of_wrong_images_is_no_fault():
-    mixed = drive(shown=lambda *at: (anywhere if at[1] // EVERY % 4 == 1 else shows())(*at))
+    mixed = drive(camera=lambda *at: (anywhere if at[1] // EVERY % 4 == 1 else shows())(*at))
     assert health_of(*mixed).well > LIKELY
 
 
@@ -144,7 +144,7 @@ ODD = {
     'one place, no heading': still(yaw=math.nan),
     'one stamp': still(step_m=1.0, step_ns=0),
     'no heading': drive(heading=False),
-    'very sure': drive(std_m=1e-4, shown=anywhere),
+    'very sure': drive(std_m=1e-4, camera=anywhere),
 }
 
 
@@ -154,15 +154,15 @@ def test_of_little_or_odd_evidence_the_answer_is_finite(name):
         warnings.simplefilter('error')
         health = health_of(*ODD[name])
     assert 0.0 <= health.well <= 1.0 and cmath.isfinite(health.size)
-    assert not math.isnan(health.confirmed_m) and math.isfinite(health.needed_m)
+    assert math.isfinite(health.confirmed_m)
 
 
 @pytest.mark.parametrize('name', FAULTS)
 def test_neither_map_nor_odometry_has_a_direction_that_matters(name):
-    shown, exact = FAULTS[name][0], 1e-9  # noise is drawn in the map's axes
-    first = health_of(*drive(shown=shown, std_m=exact))
-    assert health_of(*drive(shown=shown, std_m=exact)) == first
+    camera, exact = FAULTS[name][0], 1e-9  # noise is drawn in the map's axes
+    first = health_of(*drive(camera=camera, std_m=exact))
+    assert health_of(*drive(camera=camera, std_m=exact)) == first
     for moved in ({'frame': (-500 + 80j, -2.5)}, {'mapped': (0j, -1.0)}):
-        health = health_of(*drive(shown=shown, std_m=exact, **moved))
+        health = health_of(*drive(camera=camera, std_m=exact, **moved))
         assert health.fault == first.fault and health.well == pytest.approx(first.well, abs=1e-6)
         assert health.size == pytest.approx(first.size, abs=1e-5)

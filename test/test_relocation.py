@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where images that agree among themselves put the robot."""
+"""The pose by images that agree among themselves."""
 
 import math
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from sfa_localization.fusion.belief import CAPACITY, SPACING_M, PositionFix, remembered
 from sfa_localization.fusion.relocation import relocate
-from sfa_localization.fusion.track import CAPACITY, SPACING_M, PositionFix, remembered
 
 STD_M, STD_RAD = 0.1, 0.05
 
@@ -29,12 +29,16 @@ def along(count, step_m=0.2, heading=True, wrong=(), noise=0.0, turn=1.2, seed=0
 @pytest.mark.parametrize('heading', [True, False])
 @pytest.mark.parametrize('turn', [0.0, 1.2, math.pi])
 def test_images_along_the_odometry_show_the_pose(turn, heading):
-    found = relocate(along(21, heading=heading, wrong=(3, 4, 11), turn=turn), 1.0)
+    relocated = relocate(along(21, heading=heading, wrong=(3, 4, 11), turn=turn), 1.0)
     place = 4.0 * np.exp(1j * turn) + (5 - 3j)
-    assert found.pose[:2] == pytest.approx([place.real, place.imag], abs=1e-9)
-    assert abs(math.remainder(found.pose[2] - turn, 2 * math.pi)) < 1e-9
-    assert (found.images, found.dissenting, found.distance_m) == (18, 3, pytest.approx(4.0))
-    assert np.linalg.eigvalsh(found.covariance)[0] > 0
+    assert relocated.pose[:2] == pytest.approx([place.real, place.imag], abs=1e-9)
+    assert abs(math.remainder(relocated.pose[2] - turn, 2 * math.pi)) < 1e-9
+    assert (relocated.images, relocated.dissenting, relocated.distance_m) == (
+        18,
+        3,
+        pytest.approx(4.0),
+    )
+    assert np.linalg.eigvalsh(relocated.covariance)[0] > 0
 
 
 def test_a_place_without_heading_or_motion_shows_no_pose():
@@ -46,14 +50,14 @@ def test_errors_are_as_large_as_claimed_and_neighbors_that_err_alike_count_as_fe
     place, squared = 8.0 * np.exp(1.2j) + (5 - 3j), []
     for seed in range(50):
         seen = along(41, noise=STD_M, heading=False, seed=seed)
-        found = relocate(seen, 1e-3)
-        miss = found.pose - [place.real, place.imag, 1.2]
-        squared.append(miss @ np.linalg.solve(found.covariance, miss))
+        relocated = relocate(seen, 1e-3)
+        miss = relocated.pose - [place.real, place.imag, 1.2]
+        squared.append(miss @ np.linalg.solve(relocated.covariance, miss))
     low = chi2.ppf(0.0005, 150)
     # Dead reckoning has no error here, but is expected to drift: the claim is rather too modest.
     assert low / 2 < sum(squared) < low
     alike = relocate(seen, 2.0)
-    assert np.allclose(alike.covariance, found.covariance * 41 / (1 + 8.0 / 2.0))
+    assert np.allclose(alike.covariance, relocated.covariance * 41 / (1 + 8.0 / 2.0))
 
 
 def test_of_what_is_remembered_the_newer_half_is_complete_and_the_older_reaches_far():

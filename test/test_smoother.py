@@ -1,8 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Smoothing a drive: nearer to the truth than filtering; test_filter_consistency.py tests how sure
-it is.
-"""
+"""A smoothed drive is nearer to the truth; test_filter_consistency.py tests its covariances."""
 
 import numpy as np
 import pytest
@@ -31,17 +29,6 @@ def test_a_smoothed_drive_is_nearer_to_the_truth(heading):
     assert distances(drive, states).mean() < 0.82 * distances(drive, live).mean()
     assert np.allclose(states[-1].mean, live[-1].mean)
     assert np.allclose(states[-1].covariance, live[-1].covariance)
-
-
-def test_a_robot_that_stands_was_always_where_it_is_found_in_the_end():
-    drive = FilterDrive(
-        twists=np.zeros((500, 2)), start=(3.0, -2.0, 2.9), position_std=0.2, yaw_std=0.05
-    )
-    states = fed(Smoother(), drive).smoothed()
-    poses = np.array([state.pose for state in states])
-    assert np.abs(poses - poses[-1]).max() < 1e-3
-    stds = np.array([state.position_std for state in states])
-    assert np.allclose(stds, stds[-1], rtol=0.02)
 
 
 def test_nothing_reaches_back_beyond_a_kidnapping():

@@ -22,7 +22,7 @@ from sfa_localization.tuning import TuningDrive
 
 def tuning_drive(claimed=0.2, true=0.2, truth=True):
     """A drive whose images err by `true` m and claim a standard deviation of `claimed` m."""
-    drive = FilterDrive(seconds=40, rate_hz=20, every=4, v_std=0.02, omega_std=0.01,
+    drive = FilterDrive(seconds=20, rate_hz=20, every=4, v_std=0.02, omega_std=0.01,
                   position_std=true, yaw_std=0.05, share=0.7)  # fmt: skip
     variances = np.tile([4e-4, 1e-4], (len(drive.stamps_ns), 1))
     spread = np.diag([claimed**2, claimed**2, 0.05**2])
@@ -51,10 +51,10 @@ def test_the_likelihood_is_best_near_the_true_noise():
 
 
 def test_the_search_by_likelihood_needs_no_truth_and_stays_in_the_ranges(monkeypatch):
-    monkeypatch.setattr(tuning, 'TRIALS', 40)
+    monkeypatch.setattr(tuning, 'TRIALS', 20)
     drives = [tuning_drive(claimed=0.1, true=0.4, truth=False)]
     best = tuning.tune_by_likelihood(drives, FilterConfig())
-    before, after = (tuning.likelihood_cost(drives, one) for one in (FilterConfig(), best))
+    before, after = (tuning.likelihood_cost(drives, trial) for trial in (FilterConfig(), best))
     assert after < before - 0.05 and best.measurement_factor > 2.0
     monkeypatch.setattr(tuning, 'likelihood_cost', lambda _, config: -config.measurement_factor)
     monkeypatch.setattr(tuning, 'TRIALS', 400)
@@ -77,9 +77,9 @@ def test_the_error_is_measured_after_alignment_and_the_models_error_correlation_
     assert moved == pytest.approx(tuning.error_cost([plain], config))
     white, shared = (
         tuning.likelihood_cost(
-            [replace(plain, filter_for=partial(PoseFilter, correlation=one))], config
+            [replace(plain, filter_for=partial(PoseFilter, correlation=correlation))], config
         )
-        for one in (ErrorCorrelation(0.0, 1.0), ErrorCorrelation(0.7, 0.6))
+        for correlation in (ErrorCorrelation(0.0, 1.0), ErrorCorrelation(0.7, 0.6))
     )
     assert shared < white
 
@@ -87,21 +87,19 @@ def test_the_error_is_measured_after_alignment_and_the_models_error_correlation_
 def test_images_that_are_stamped_late_are_no_noise_and_unusable_ones_do_not_count():
     """Training and turns of the images show the delay in a trial as they do live."""
     plain, config = tuning_drive(claimed=0.05, true=0.02), FilterConfig()
-    late = [replace(one, stamp_ns=one.stamp_ns + 300_000_000) for one in plain.observations]
+    late = [replace(image, stamp_ns=image.stamp_ns + 300_000_000) for image in plain.observations]
     by_turns = replace(plain, observations=late)
-    unturned = replace(plain, observations=[replace(one, turned=math.nan) for one in late])
+    unturned = replace(plain, observations=[replace(image, turned=math.nan) for image in late])
     by_training = replace(unturned, filter_for=late_filter)
     drives = plain, by_training, by_turns, unturned
-    costs = [tuning.likelihood_cost([one], config) for one in drives]
-    errors = [tuning.error_cost([one], config) for one in drives]
+    costs = [tuning.likelihood_cost([each], config) for each in drives]
+    errors = [tuning.error_cost([each], config) for each in drives]
     # Without turns the filter learns the delay from the way alone, later.
     assert costs[1] == pytest.approx(costs[0]) and costs[1] < costs[2] < costs[3]
     assert errors[1] < 1.2 * errors[0] and errors[2] < 0.5 * errors[3], errors
-    dark = [
-        replace(one, problem='dark', covariance=unusable_covariance(), stamp_ns=one.stamp_ns + 1)
-        for one in plain.observations
-    ]
-    images = sorted([*plain.observations, *dark], key=lambda one: one.stamp_ns)
+    unusable = {'problem': 'dark', 'covariance': unusable_covariance()}
+    dark = [replace(image, **unusable, stamp_ns=image.stamp_ns + 1) for image in plain.observations]
+    images = sorted([*plain.observations, *dark], key=lambda image: image.stamp_ns)
     with_dark = replace(plain, observations=images)
     for cost in (tuning.likelihood_cost, tuning.error_cost):
         assert cost([with_dark], config) == pytest.approx(cost([plain], config))

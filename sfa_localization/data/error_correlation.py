@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Correlation of the position errors of neighboring images, learned together with the map.
+"""Correlation of the position errors of neighboring images, estimated from held-out images.
 
-Images of one place have similar errors, because the map is wrong there; a filter that took each of
-them as independent would be overconfident. The trainer estimates it from held-out images.
+Images of one place have similar errors, because the map is wrong there: a filter that takes them as
+independent is overconfident.
 """
 
 from __future__ import annotations
@@ -19,19 +19,14 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.statistics import LENGTH_TO_STD
 
 LEAST_M = 0.01
-"""Images nearer to each other than this show one place: no errors change over less."""
+"""Least correlation distance: images nearer to each other show the same place."""
 LARGEST_SHARE = 0.95
 """Below 1, so that every image remains some evidence."""
-_FARTHEST_M = 8.0
-"""Pairs farther apart (m) do not change the fit: their errors hardly correlate."""
-_DISTANCES_M = np.geomspace(0.1, 20.0, 81)
-"""Correlation distances that are tried (m)."""
-_BINS_M = np.geomspace(0.02, _FARTHEST_M, 25)
-"""Edges of the bins of the distance between two images (m)."""
-_ENOUGH_PAIRS = 200
-"""With fewer pairs the estimate scatters more than the default is wrong."""
-_OUTLYING = 3.0
-"""Errors are limited to this many typical ones."""
+_FARTHEST_M = 8.0  # errors of images farther apart hardly correlate
+_DISTANCES_M = np.geomspace(0.1, 20.0, 81)  # correlation distances that are tried
+_BINS_M = np.geomspace(0.02, _FARTHEST_M, 25)  # edges of the bins of the distance of two images
+_ENOUGH_PAIRS = 200  # with fewer, the estimate scatters more than the default is wrong
+_OUTLYING = 3.0  # errors are limited to so many typical ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,30 +52,30 @@ class ErrorCorrelation:
     ) -> ErrorCorrelation:
         """From errors (M, 2) m of images with predicted variances (M,) m^2 per axis.
 
-        `driven_m` (M,) is the distance driven before, `owner` (M,) the segment of each image:
-        images are compared inside one segment. Outliers are limited. With too few images the
-        defaults.
+        `driven_m` (M,) is the distance driven before each image, `owner` (M,) its segment: images
+        are compared inside a segment. Outliers are limited. Too few images give the defaults.
         """
-        apart, product = _pairs(_standardized(errors, variances), driven_m, owner)
-        if len(apart) < _ENOUGH_PAIRS:
+        spacing, product = _pairs(_standardized(errors, variances), driven_m, owner)
+        if len(spacing) < _ENOUGH_PAIRS:
             return cls()
-        at = np.digitize(apart, _BINS_M)
+        at = np.digitize(spacing, _BINS_M)
         count = np.bincount(at, minlength=len(_BINS_M) + 1)
         filled = np.flatnonzero(count)
-        distance = np.bincount(at, apart)[filled] / count[filled]
+        distance = np.bincount(at, spacing)[filled] / count[filled]
         correlation = np.bincount(at, product)[filled] / count[filled]
         return cls(*_exponential(distance, correlation, count[filled].astype(float)))
 
     def alike(self, driven_m: Array) -> Array:
-        """How many (M,) of the errors of images, driven_m (M,) m along the path, count as one: the
-        sum of the correlations of each with all."""
+        """The sum (M,) of the correlations of each error with all, for images at `driven_m` (M,):
+        so many errors weigh as much as a single one.
+        """
         order = np.argsort(driven_m, kind='stable')
         path, total = driven_m[order], np.ones(len(driven_m))
         for lag in range(1, len(path)):
-            apart = path[lag:] - path[:-lag]
-            if apart.min() > _FARTHEST_M:
+            spacing = path[lag:] - path[:-lag]
+            if spacing.min() > _FARTHEST_M:
                 break
-            correlation = self.share * np.exp(-apart / self.distance_m)
+            correlation = self.share * np.exp(-spacing / self.distance_m)
             total[lag:] += correlation
             total[:-lag] += correlation
         return np.asarray(total[np.argsort(order)])
@@ -97,15 +92,15 @@ def _standardized(errors: Array, variances: Array) -> Array:
 
 def _pairs(ratio: Array, driven_m: Array, owner: NDArray[np.int64]) -> tuple[Array, Array]:
     """Distance and mean product of all pairs inside a segment and nearer than _FARTHEST_M."""
-    apart, product = [np.zeros(0)], [np.zeros(0)]
+    spacing, product = [np.zeros(0)], [np.zeros(0)]
     for lag in range(1, len(ratio)):
         distance = driven_m[lag:] - driven_m[:-lag]
         near = (owner[lag:] == owner[:-lag]) & (distance < _FARTHEST_M)
         if not near.any():
             break
-        apart.append(distance[near])
+        spacing.append(distance[near])
         product.append((ratio[lag:][near] * ratio[:-lag][near]).mean(1))
-    return np.concatenate(apart), np.concatenate(product)
+    return np.concatenate(spacing), np.concatenate(product)
 
 
 def _exponential(distance: Array, correlation: Array, weight: Array) -> tuple[float, float]:

@@ -1,10 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which steps between two poses of odometry no robot makes: the same rule in training and live.
+"""Steps of the odometry that no robot can make: one rule for training and for the live filter.
 
-A step is a break where none of the speeds around it explains it: it lies farther than `tolerance`
-from where every one of them leads (`beyond`). Wheel ticks that jump, a driver that starts anew and
-a robot that was carried look so; nothing is assumed of the motion between the two poses then.
+A step is a break where no speed before or after it explains it: it ends farther than `tolerance`
+from where each of them leads (`beyond`). Causes are wheel ticks that jump, a driver that restarts
+and a robot that was carried; the motion between the two poses is then unknown.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from numpy.typing import ArrayLike
 from sfa_localization.data.geometry import Array
 
 JUMP = 0.05
-"""m or rad that quantized and rounded poses may move beyond any speed."""
+"""m or rad by which quantized and rounded poses may miss any speed."""
 ACCELERATION, RAMP_S = 5.0, 0.2
 """Change of speed (m/s^2, rad/s^2) that wheels on the ground reach, and the time for which it may
-act unseen, which changes the speed by 1 m/s: longer ramps appear in the speeds around."""
+act within a step: longer ramps appear in the speeds before and after."""
 NOISE = 6.0
-"""Standard deviations of the odometry's usual noise that a break exceeds, too."""
+"""Standard deviations of the odometry's noise that a break exceeds as well."""
 
 
 def beyond(step: ArrayLike, seconds: ArrayLike, speeds: Sequence[ArrayLike]) -> Array:
-    """How far (...) steps (..., K) lie from where each of some speeds (..., K) leads, the least.
+    """The least distance (...) of steps (..., K) from where each of the speeds (..., K) leads.
 
-    Positions (K = 2, m) and headings (K = 1, rad, wrapped) are judged apart, in the frame of the
-    robot before the step. `seconds` (...) is the longest time that a step may have taken: a robot
-    may stop within it, and stamps may be late.
+    Steps are positions (K = 2, m) or headings (K = 1, rad, wrapped) in the frame of the robot
+    before. `seconds` (...) is the longest time that a step may have taken: a robot may stop within
+    it, and stamps may be late.
     """
     moved, longest_s = np.asarray(step, float), np.asarray(seconds, float)[..., None]
     distances = []
@@ -43,9 +43,9 @@ def beyond(step: ArrayLike, seconds: ArrayLike, speeds: Sequence[ArrayLike]) -> 
 
 
 def tolerance(seconds: ArrayLike, noise: float) -> Array:
-    """What steps of these `seconds` (...) may be `beyond` their speeds, m or rad (...).
+    """The largest distance (...) `beyond` any speed, m or rad, of possible steps of `seconds`.
 
-    `noise` is the standard deviation, m or rad, by which this odometry's steps usually are.
+    `noise` is the standard deviation of this odometry's steps, m or rad.
     """
     longest_s = np.asarray(seconds, float)
     return np.asarray(

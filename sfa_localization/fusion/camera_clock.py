@@ -24,10 +24,8 @@ SIGNIFICANT_STDS = 2.5
 """Standard deviations that a delay must exceed before it is compensated."""
 _STEP_S = 0.02
 _GRID = np.arange(-round(CLOCK_RANGE_S / _STEP_S), round(CLOCK_RANGE_S / _STEP_S) + 1) * _STEP_S
-# Pairs of images farther apart in time, or with a pause of the odometry between, are left out.
-_PAIR_NS, _PAUSE_NS = 1_000_000_000, 500_000_000
-# An estimate applies to images stamped so much later, so that it does not depend on which message
-# came first.
+_PAIR_NS, _PAUSE_NS = 1_000_000_000, 500_000_000  # pairs with longer ones between are left out
+# An estimate applies to images stamped so much later, whichever message came first.
 _IN_TRANSIT_NS, _REMEMBERED_NS = 1_000_000_000, 10_000_000_000
 _WINDOW_NS = round(CLOCK_RANGE_S * 1e9) + 100_000_000
 # Residuals beyond _OUTLIER of _SCALE_RAD are mismatches of images and count no more; sums of them
@@ -76,17 +74,11 @@ class CameraClockFinder:
         self._start = start or CameraClock()
         self._estimates: deque[tuple[int, CameraClock]] = deque([(0, self._start)])
         self._driven: deque[tuple[int, float]] = deque()
-        self._pauses: deque[int] = deque()
         self._last: tuple[int, float] | None = None
         self._pairs: deque[tuple[int, int, float]] = deque()
         # By the sign of the columns and the delay: cost, its curvature, and of the pairs with
         # turns their number, their size and their residuals.
         self._cost, self._power, self._turns, self._size, self._error = np.zeros((5, 2, len(_GRID)))
-
-    def expect(self, clock: CameraClock) -> None:
-        """Use this estimate before any other."""
-        self._start = clock
-        self._estimates[0] = 0, clock
 
     @property
     def clock(self) -> CameraClock:
@@ -106,8 +98,6 @@ class CameraClockFinder:
             last_ns, last_yaw = self._driven[-1]
             if stamp_ns <= last_ns:
                 return
-            if stamp_ns - last_ns > _PAUSE_NS:
-                self._pauses.append(stamp_ns)
             yaw_rad = last_yaw + float(wrap_angle(yaw_rad - last_yaw))
         self._driven.append((stamp_ns, yaw_rad))
         while self._pairs and self._pairs[0][1] + _WINDOW_NS <= stamp_ns:
@@ -129,12 +119,11 @@ class CameraClockFinder:
     def _compare(self, start_ns: int, stop_ns: int, turn: float) -> None:
         """Add a pair of images to all sums, once odometry surrounds it by any delay."""
         first, last = start_ns - _WINDOW_NS, stop_ns + _WINDOW_NS
-        while self._pauses and self._pauses[0] < first:
-            self._pauses.popleft()
-        if first < self._driven[0][0] or (self._pauses and self._pauses[0] <= last):
+        stamps_ns, yaw = map(np.array, zip(*self._driven, strict=True))
+        pauses_ns = stamps_ns[1:][np.diff(stamps_ns) > _PAUSE_NS]
+        if first < stamps_ns[0] or np.any((first <= pauses_ns) & (pauses_ns <= last)):
             return
-        stamps_ns, yaw = zip(*self._driven, strict=True)
-        seconds, span = (np.array(stamps_ns) - start_ns) * 1e-9, (stop_ns - start_ns) * 1e-9
+        seconds, span = (stamps_ns - start_ns) * 1e-9, (stop_ns - start_ns) * 1e-9
         driven = np.interp(span - _GRID, seconds, yaw) - np.interp(-_GRID, seconds, yaw)
         residual = np.abs(wrap_angle(np.array([[turn], [-turn]]) - driven)) / _SCALE_RAD
         limited, turning = np.minimum(residual, _OUTLIER), np.abs(driven) > _TURN_RAD

@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the belief follows from the one before and an event: predict, update, or start anew.
 
-Each is a pure function, so that late events can be placed where they belong: see `history`. The
-equations of prediction and update are filterpy's.
+Each is a pure function, so that late events can be placed where they belong: see `history`.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import (
     Belief,
-    DelayEvent,
     Event,
     Jump,
     MeasurementEvent,
@@ -27,53 +25,36 @@ from sfa_localization.fusion.belief import (
     Odometer,
     OdometryEvent,
     PoseEvent,
+    PositionFix,
     Update,
+    remembered,
 )
 from sfa_localization.fusion.camera_clock import SIGNIFICANT_STDS
-from sfa_localization.fusion.motion import (
-    DELAY,
-    ERROR,
-    LOSS,
-    SIZE,
-    YAW,
-    MotionNoise,
-    Step,
-    Twist,
-    V,
-)
+from sfa_localization.fusion.motion import DELAY, ERROR, SIZE, YAW, MotionNoise, Step, Twist, V
 from sfa_localization.fusion.odometry import COAST_S, interval, jump, received, repeats
-from sfa_localization.fusion.relocation import relocate
+from sfa_localization.fusion.relocation import Relocation, relocate
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import DEGRADED_YAW_RAD
-from sfa_localization.fusion.track import DrivenPath, PositionFix, remembered
 
 STARTED, ELSEWHERE = STARTS = 'started', 'restarted elsewhere'
 """Reasons of updates that take a pose from measurements alone."""
-ALIKE_SHARE = 0.2
-"""Where neighbors share less of their errors, positions are those of a sensor with white errors."""
 GATE = {2: 13.815510557964274, 3: 16.26623619623813}
 OUTLYING = {2: 3.2188758248682006, 3: 4.641627676087445}
-"""Of squared distances of right measurements, by dimensions (chi-square): one in a thousand is
-rejected. Errors of images have heavy tails, so the outlying fifth loses weight."""
+"""Squared distances, by dimensions, that one right measurement in a thousand, and in five, exceeds
+(chi-square). Those beyond the first are rejected, those beyond the second lose weight."""
+ALIKE_SHARE = 0.2
+"""Where neighbors share less of their errors, positions are those of a sensor without outliers."""
 
 
 class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
-    """filterpy's equations as pure functions; only the last innovation is kept between calls."""
+    """The equations as pure functions, the update by filterpy, which keeps the last innovation."""
 
     def __init__(self) -> None:
         super().__init__(SIZE, 3)
-        self._next_mean: Array = np.zeros(SIZE)
 
     def predicted(self, belief: Belief, step: Step) -> Array:
         """Covariance (12, 12) after a prediction: F P F^T + Q."""
-        self.x, self.P, self._next_mean = belief.mean, belief.covariance, step.mean
-        self.F, self.Q = step.jacobian, step.noise
-        self.predict()
-        return np.asarray(self.P)
-
-    def predict_x(self, u: object = 0) -> None:
-        """filterpy's hook: the motion model is nonlinear."""
-        self.x = self._next_mean
+        return step.jacobian @ belief.covariance @ step.jacobian.T + step.noise
 
     def corrected(
         self, belief: Belief, z: Array, jacobian: Array, noise: Array
@@ -118,7 +99,7 @@ class Ekf:
         of_robot = motion.BIAS_STD, scale_std, rig.turn_loss.std, rig.camera_delay.std
         covariance = np.diag(np.square([1, 1, 1, speed_std, rate_std, *of_robot, 1, 1, 1]))
         mean = np.zeros(SIZE)
-        mean[LOSS] = rig.turn_loss.value
+        mean[motion.LOSS] = rig.turn_loss.value
         twist = Twist(0.0, 0.0, speed_std**2, rate_std**2)
         nowhere = (0.0, 0.0, 0.0)
         return Belief(stamp_ns, mean, covariance, False, nowhere, 0.0, twist, Odometer(), Memory())
@@ -130,12 +111,9 @@ class Ekf:
         belief = self.coast(belief, event.stamp_ns)
         if isinstance(event, PoseEvent):
             placed = _at_pose(belief, event.pose, event.covariance, 0.0)
-            trusted = DrivenPath(belief.path.knots, since_m=-math.inf)
-            return placed._replace(memory=Memory(), path=trusted)
-        belief = _with_delay(belief, event.late)
-        if isinstance(event, DelayEvent):  # which is why images in a row contradicted the estimate
-            return belief._replace(memory=belief.memory._replace(rejected=0))
-        return self._measured(belief, event)
+            path = belief.path._replace(placed_m=(-math.inf,))
+            return placed._replace(memory=Memory(), path=path)
+        return self._measured(with_delay(belief, event.late), event)
 
     # Predict.
 
@@ -222,13 +200,13 @@ class Ekf:
         if event.value.size == 3:
             x, y, yaw = event.covariance.diagonal().tolist()
             if max(x, y) <= config.lost_std**2 and yaw <= config.lost_yaw_std**2:
-                return self._restarted(belief, event, STARTED, event.value, event.covariance)
+                start = Relocation(event.value, event.covariance, 1, 0.0, True)
+                return self._restarted(belief, event, STARTED, start)
             reason = 'too uncertain to start from'
         else:
             place = relocate(images, self._correlation.distance_m)
             if place is not None and place.shows_heading(len(images)):
-                pose = place.pose, place.covariance, place.distance_m
-                return self._restarted(belief, event, STARTED, *pose)
+                return self._restarted(belief, event, STARTED, place)
             reason = 'heading unknown yet'
         update = Update(event.stamp_ns, False, math.nan, math.nan, reason)
         return belief._replace(memory=belief.memory._replace(images=images, update=update))
@@ -236,8 +214,8 @@ class Ekf:
     def _gated(
         self, belief: Belief, event: MeasurementEvent, images: tuple[PositionFix, ...]
     ) -> Belief:
-        """Accept what lies inside the gate, where the outlying fifth loses weight. What lies
-        outside is rejected, or restarts the filter where rejected images outweigh the estimate.
+        """Accept what lies inside the gate, with less weight where it is outlying; reject what lies
+        outside, or restart where the rejected images outweigh the estimate.
         """
         kalman, memory, size = self._kalman, belief.memory, event.value.size
         z, jacobian, white = self._linearized(belief, event)
@@ -248,8 +226,7 @@ class Ekf:
         if not inside:
             place = relocate(images, self._correlation.distance_m) if len(images) > 1 else None
             if place is not None and place.outweighs(belief):
-                pose = place.pose, place.covariance, place.distance_m
-                return self._restarted(belief, event, ELSEWHERE, *pose)
+                return self._restarted(belief, event, ELSEWHERE, place)
             rejected = memory._replace(rejected=memory.rejected + 1, images=images, update=update)
             return belief._replace(memory=rejected)
         outlying = d2 / OUTLYING[size]
@@ -273,20 +250,14 @@ class Ekf:
         return event.value - event.late.value * moving, jacobian, (1 - share) * event.covariance
 
     def _restarted(
-        self,
-        belief: Belief,
-        event: MeasurementEvent,
-        reason: str,
-        pose: Array,
-        covariance: Array,
-        distance_m: float = 0.0,
+        self, belief: Belief, event: MeasurementEvent, reason: str, place: Relocation
     ) -> Belief:
-        """At the pose that images over a distance show, or at the event's."""
-        since_m, path = belief.traveled_m - distance_m, belief.path
-        path = path.placed(since_m) if reason == ELSEWHERE else path._replace(since_m=since_m)
+        """The belief at the place that images show."""
+        since_m, path = belief.traveled_m - place.distance_m, belief.path
+        path = path.placed(since_m) if reason == ELSEWHERE else path._replace(placed_m=(since_m,))
         update = Update(event.stamp_ns, True, math.nan, math.nan, reason)
         memory = Memory(support=1, accepted_ns=event.stamp_ns, update=update)
-        placed = _at_pose(belief, pose, covariance, self._correlation.share)
+        placed = _at_pose(belief, place.pose, place.covariance, self._correlation.share)
         # Images show where the robot was a delay ago.
         variance, by_delay = placed.covariance[DELAY, DELAY], np.zeros(SIZE)
         by_delay[:3], by_delay[DELAY] = motion.velocity(placed.mean), 1.0
@@ -296,7 +267,7 @@ class Ekf:
         return placed._replace(memory=memory, path=path)
 
 
-def _with_delay(belief: Belief, late: Quantity) -> Belief:
+def with_delay(belief: Belief, late: Quantity) -> Belief:
     """The delay by the turns of the images replaces the state's where they contradict each other.
     The rest of the state follows by its regression on the delay (Jeffrey's rule).
     """

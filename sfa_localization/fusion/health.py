@@ -27,11 +27,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sfa_localization.data.geometry import Array, Complex
+from sfa_localization.fusion.belief import LONGEST_DELAY_S, Columns, DrivenPath, PositionFix
 from sfa_localization.fusion.relocation import AGREEING_M
-from sfa_localization.fusion.track import LONGEST_DELAY_S, Columns, DrivenPath, PositionFix
 
 LIKELY = 0.9
-"""Probability of nothing harmful from which the estimate is trusted."""
+"""Least probability of no harmful fault with which the estimate is trusted."""
 LATE_PRIOR, PRIOR = 2e-2, 5e-3
 """Prior probability of all delays together, and of each other fault, in any window: once in some
 hundred meters."""
@@ -98,11 +98,9 @@ def _sentence(fault: str, size: complex) -> str:
 
 def health_of(path: DrivenPath, fixes: Sequence[PositionFix]) -> Health:
     """The health by images beside a path."""
-    traveled_m = fixes[-1].traveled_m if fixes else 0.0
-    # Each time that it is placed anew, by images that agree over as many meters, doubles them.
-    placed_m = (path.since_m, *path.placed_m)
-    needed_m = min(AGREEING_M * 2.0 ** max(len(placed_m) - 2, 0), LONGEST_M)
-    confirmed_m = max(traveled_m - placed_m[-1], 0.0)
+    confirmed_m = max((fixes[-1].traveled_m if fixes else 0.0) - path.placed_m[-1], 0.0)
+    # Each time that images which agree over as many meters place it anew doubles them.
+    needed_m = min(AGREEING_M * 2.0 ** max(len(path.placed_m) - 2, 0), LONGEST_M)
     new = [fix for fix in fixes if fix.is_new]
     if len(new) <= 3:  # so few always lie on some path
         return Health(1.0, '', 0j, confirmed_m, needed_m)

@@ -16,7 +16,6 @@ from typing import Generic, TypeVar
 E = TypeVar('E')
 B = TypeVar('B')
 Key = tuple[int, int]
-_SLACK = 64  # events added between two clean-ups, which cost a copy of the lists
 
 
 class History(Generic[E, B]):
@@ -36,7 +35,6 @@ class History(Generic[E, B]):
     ) -> None:
         self._span_ns, self._step, self._keep = span_ns, step, keep
         self._base, self._horizon_ns = start, start_ns
-        self._until_forgetting = _SLACK
         self._keys: list[Key] = []
         self.events: list[E] = []
         self._beliefs: list[B] = []
@@ -64,15 +62,16 @@ class History(Generic[E, B]):
         return self._horizon_ns is None or stamp_ns > self._horizon_ns
 
     def add(self, key: Key, event: E) -> B:
-        """Place an event, in place of one of the same key. Returns the belief right after it."""
-        at = bisect_left(self._keys, key)
-        replaced = at + self.holds(key)
-        self._keys[at:replaced], self.events[at:replaced] = [key], [event]
+        """Place an event, after those of the same key. Returns the belief right after it."""
+        at = bisect_right(self._keys, key)
+        self._keys.insert(at, key)
+        self.events.insert(at, event)
         del self._beliefs[at:]
         belief = self._belief(at + 1)
-        self._until_forgetting -= 1
-        if self._until_forgetting <= 0 and not self._keep:
-            self._forget()
+        cut = bisect_left(self._keys, (self._keys[-1][0] - self._span_ns, 0))
+        if cut and not self._keep:
+            self._base, self._horizon_ns = self._belief(cut), self._keys[cut - 1][0]
+            del self._keys[:cut], self.events[:cut], self._beliefs[:cut]
         return belief
 
     def before(self, stamp_ns: int) -> B:
@@ -86,11 +85,3 @@ class History(Generic[E, B]):
             belief = self._step(belief, event)
             self._beliefs.append(belief)
         return self._beliefs[count - 1] if count else self._base
-
-    def _forget(self) -> None:
-        """Drop what lies beyond the span; its last belief is the new base."""
-        self._until_forgetting = _SLACK
-        cut = bisect_left(self._keys, (self._keys[-1][0] - self._span_ns, 0))
-        if cut:
-            self._base, self._horizon_ns = self._belief(cut), self._keys[cut - 1][0]
-            del self._keys[:cut], self.events[:cut], self._beliefs[:cut]

@@ -35,23 +35,18 @@ from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, wrap_angle
 
 X, Y, YAW, V, OMEGA, BIAS, SCALE, LOSS, DELAY, ERROR = range(10)
 SIZE = 12
-TURN_RADIUS_M = 0.25
-"""Distance that one radian of turning counts as: about half the track of a small robot."""
-YAW_PER_METER = 0.005
-"""Heading error that grows with the distance, rad per sqrt(m): turns that wheels do not show."""
-ODOMETRY_CORRELATION_S = 0.1
-"""Time for which odometry readings err alike: about the time constant of a wheel controller."""
+TURN_RADIUS_M = 0.25  # one radian of turning counts as this way: half the track of a small robot
+YAW_PER_METER = 0.005  # rad per sqrt(m): turns that wheels do not show
+ODOMETRY_CORRELATION_S = 0.1  # readings err alike for the time constant of a wheel controller
 BIAS_WALK, SCALE_WALK, LOSS_WALK, DELAY_WALK = 1e-4, 1e-3, 1e-3, 1e-3
 """Random walks: turn-rate bias of a cheap gyroscope, rad/s per sqrt(s); wheel scale, 1/sqrt(m), a
 percent over 100 m; loss in turns, m/rad per sqrt(rad); delay of the camera, s per sqrt(s)."""
-ACCELERATION = 1.0
-"""Change of speed (m/s) and turn rate (rad/s) per sqrt(s) without new odometry."""
+ACCELERATION = 1.0  # change of speed (m/s) and turn rate (rad/s) per sqrt(s) without odometry
 UNKNOWN_SPEED, UNKNOWN_RATE = 0.5, 0.5
 """Speed (m/s) and turning (rad per sqrt(s)) of a robot whose odometry is silent for long."""
 STANDSTILL_SPEED, STANDSTILL_RATE = 1e-3, 2e-3
 """A robot slower (m/s) and turning slower (rad/s) than this stands: encoders and gyros flicker."""
-BIAS_STD = 0.01
-"""Standard deviation of the turn-rate bias before any is learned, rad/s: cheap gyroscopes."""
+BIAS_STD = 0.01  # rad/s, of the turn-rate bias before any is learned: cheap gyroscopes
 _HELD_VARIANCE = 1e-8  # of v and omega at a standstill: keeps the covariance positive
 _STRAIGHT_RAD = 1e-4  # half turns below this are summed as series, exact to rounding
 
@@ -117,10 +112,7 @@ class Step(NamedTuple):
 
 
 class MotionNoise(NamedTuple):
-    """How driving makes the state uncertain; see the parameters of these names.
-
-    `decorrelation_m` is the distance over which the error that images share fades.
-    """
+    """The parameters of these names, and the distance over which the errors of images fade."""
 
     slip_per_meter: float
     yaw_per_radian: float

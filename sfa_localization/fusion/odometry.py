@@ -13,20 +13,16 @@ import math
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.odometry_steps import beyond, tolerance
 from sfa_localization.fusion import motion
-from sfa_localization.fusion.belief import Belief, Jump, Odometer, OdometryEvent
+from sfa_localization.fusion.belief import Belief, Jump, Odometer, OdometryEvent, Pose
 from sfa_localization.fusion.motion import Twist
-from sfa_localization.fusion.track import Pose
 
-ODOMETRY_TIMEOUT_S = 0.5
-"""Odometry silent for longer is a gap: many times the period of any odometry."""
-COAST_S = 2.0
-"""Silence for which the last speed is assumed to go on: about how long robots keep a speed."""
-_LEARNING, _LEAST_NOISE = 0.1, 1e-3
-"""Relative change per message of the usual noise of steps, learned over about twenty; m or rad."""
-_LONGEST_S = math.pi / motion.UNKNOWN_RATE
-"""After a longer silence a robot may be headed anywhere, so that no step is impossible."""
-_ROUNDED_M = 2e-3
-"""A pose moves less than this sideways by its rounding."""
+ODOMETRY_TIMEOUT_S, COAST_S = 0.5, 2.0
+"""Odometry silent for longer is a gap: many times the period of any odometry. The last speed is
+assumed to go on for 2 s: about how long robots keep a speed."""
+_LEARNING, _LEAST_NOISE = 0.1, 1e-3  # relative change per message of the steps' noise; m or rad
+_LONGEST_S = math.pi / motion.UNKNOWN_RATE  # of a silence after which any heading is possible
+_JUMP = 0.05  # m or rad: motion beyond twice the speed by more took longer than stamps say
+_ROUNDED_M = 2e-3  # a pose moves less sideways by its rounding
 
 
 def repeats(belief: Belief, event: OdometryEvent) -> bool:
@@ -174,3 +170,19 @@ def _twist_between(before: Pose, after: Pose, seconds: float, reading: Twist) ->
     half = turn / 2
     arc = chord * (half / math.sin(half) if half else 1.0)
     return reading._replace(v=arc / seconds, omega=turn / seconds)
+
+
+def stalled(before: Belief, after: Belief, taken_ns: int, stamp_ns: int) -> bool:
+    """Whether the odometry between two stamps shows far more motion than it takes, after a silence
+    in which it shows far less: a network that stalled handed over all at once.
+    """
+    if after.odometry.stamp_ns is None or after.odometry.stamp_ns <= taken_ns:
+        return False
+    seconds, silent_s = (stamp_ns - taken_ns) * 1e-9, (taken_ns - before.stamp_ns) * 1e-9
+    turn, *way = _moved(before.dead_reckoned, after.dead_reckoned)
+    driven = (math.hypot(*way), before.twist.v, after.twist.v)
+    turned = (abs(turn), before.twist.omega, after.twist.omega)
+    return any(
+        moved > 2 * max(abs(a), abs(b)) * seconds + _JUMP or abs(a) * silent_s > moved + _JUMP
+        for moved, a, b in (driven, turned)
+    )

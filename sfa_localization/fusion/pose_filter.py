@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,12 +24,12 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.belief import (
     Belief,
-    DelayEvent,
     Event,
     MeasurementEvent,
     OdometryEvent,
     PoseEvent,
     Update,
+    newest_new,
 )
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
 from sfa_localization.fusion.ekf import Ekf
@@ -36,7 +37,7 @@ from sfa_localization.fusion.health import Health, health_of
 from sfa_localization.fusion.history import History
 from sfa_localization.fusion.inputs import OpenLoop, read_measurement, read_pose, read_twist
 from sfa_localization.fusion.motion import State
-from sfa_localization.fusion.odometry import COAST_S, ODOMETRY_TIMEOUT_S
+from sfa_localization.fusion.odometry import COAST_S, ODOMETRY_TIMEOUT_S, stalled
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level, Status, status_of
 from sfa_localization.fusion.timeline import (
@@ -47,7 +48,6 @@ from sfa_localization.fusion.timeline import (
     ClockWentBack,
     Timeline,
 )
-from sfa_localization.fusion.track import newest_new
 
 __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
 
@@ -150,7 +150,8 @@ class PoseFilter:
         try:
             commands = self._open_loop.repeats
             twist = read_twist(self.scale * v, omega, variances, self.config, commands)
-            self._timeline.require_order(stamp_ns, ODOMETRY, self._history)
+            again = partial(self.add_odometry, stamp_ns, v, omega, variances, pose)
+            self._timeline.require_order(stamp_ns, ODOMETRY, self._history, again)
             self._require_place(stamp_ns, ODOMETRY)
         except DataError as error:
             self.counts[f'odometry: {error}'] += 1
@@ -175,15 +176,15 @@ class PoseFilter:
         stamp_ns = int(stamp_ns)
         try:
             fused, noise = read_measurement(value, covariance, self.config.measurement_factor)
-            self._timeline.require_order(stamp_ns, MEASUREMENT, self._history)
+            again = partial(self.add_measurement, stamp_ns, value, covariance)
+            self._timeline.require_order(stamp_ns, MEASUREMENT, self._history, again)
             clock = self._camera.clock_at(stamp_ns)
-            # When the image was taken, on the clock of the odometry.
-            taken_ns = max(stamp_ns - clock.delay_ns, 1) if stamp_ns > 0 else stamp_ns
+            taken_ns = stamp_ns - clock.delay_ns  # by the clock of the odometry
+            around = self._history.before(taken_ns), self._history.before(stamp_ns)
+            if clock.delay_ns and stalled(*around, taken_ns, stamp_ns):
+                taken_ns = stamp_ns  # all messages were late: the order of the stamps says more
             self._require_place(taken_ns, MEASUREMENT)
             late = Quantity(clock.delay_ns * 1e-9 - self._expected_s, clock.std_s)
-            if abs(clock.delay_ns) > DELAY_LIMIT_NS:
-                self._history.add((taken_ns, MEASUREMENT), DelayEvent(taken_ns, late))
-                raise DataError('clocks of camera and odometry are more than 0.5 s apart')
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
@@ -213,7 +214,7 @@ class PoseFilter:
         delay_s = rig.camera_delay.value
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.is_estimated:
             self._expected_s = delay_s
-            self._camera.expect(CameraClock(delay_s, assumed=True))
+            self._camera = CameraClockFinder(_CLOCK_MEMORY, CameraClock(delay_s, assumed=True))
         belief, prior = self._history.newest, self._ekf.blank(0)
         # The pose of odometry jumps to the new scale: forget the one before.
         belief = belief._replace(odometry=belief.odometry._replace(pose=None))

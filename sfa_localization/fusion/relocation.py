@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.fusion.belief import ENOUGH_IMAGES, Belief
+from sfa_localization.fusion.belief import ENOUGH_IMAGES, Belief, Columns, PositionFix
 from sfa_localization.fusion.motion import YAW
-from sfa_localization.fusion.track import Columns, PositionFix
 
 FEW_IMAGES = 3
 """Agreement that is no coincidence: two images always agree on some motion, the third checks."""
@@ -30,25 +29,22 @@ START_YAW_STD = 0.3
 """rad: positions alone must determine the heading to this; the EKF is linear enough up to there."""
 AGREEING_PER_OTHER = 3
 """With fewer agreeing images per accepted one on the same path, the estimate is rather right."""
-OBVIOUS_STDS, OBVIOUS_JUMP_M = 8.0, 1.5
-"""A displacement larger than both 8 standard deviations of an image and this (m) has no
-other explanation than that the robot was moved; a smaller one may be the map's error."""
+OBVIOUS_JUMP_M = 1.5
+"""A larger displacement shows that the robot was moved; a smaller one may be the map's error."""
 _TINY = 1e-12  # keeps the variance finite where a lone position shows no turn
 
 
 class Relocation(NamedTuple):
-    """Where agreeing images put the robot now: pose (3,), covariance (3, 3).
-
-    Over the same distance, `contradicting` counts what the filter accepted, `dissenting` what it
-    rejected but does not agree either. `position_std` and `yaw_std` are the mean claimed ones.
+    """Where agreeing images put the robot now: pose (3,), covariance (3, 3). `have_yaw`: they show
+    headings. Over the same distance, `contradicting` counts those that the filter accepted,
+    `dissenting` others that it rejected.
     """
 
     pose: Array
     covariance: Array
     images: int
     distance_m: float
-    position_std: float
-    yaw_std: float
+    have_yaw: bool
     contradicting: int = 0
     dissenting: int = 0
 
@@ -66,12 +62,11 @@ class Relocation(NamedTuple):
         enough = images >= min(ENOUGH_IMAGES, max(2, support + 1))
         if not enough or self.covariance[YAW, YAW] > START_YAW_STD**2:
             return False
-        if self.distance_m >= max(AGREEING_M, OBVIOUS_STDS * self.position_std):
+        if self.distance_m >= AGREEING_M:
             return True
         # An image turned in its place may be the camera's fault; one elsewhere is not.
-        jump_m = math.hypot(*(self.pose[:2] - belief.mean[:2]))
-        elsewhere = jump_m >= max(OBVIOUS_JUMP_M, OBVIOUS_STDS * self.position_std)
-        return (support < ENOUGH_IMAGES or elsewhere) and self.yaw_std < math.inf
+        elsewhere = math.hypot(*(self.pose[:2] - belief.mean[:2])) >= OBVIOUS_JUMP_M
+        return self.have_yaw and (support < ENOUGH_IMAGES or elsewhere)
 
 
 def relocate(fixes: Sequence[PositionFix], decorrelation_m: float) -> Relocation | None:
@@ -146,6 +141,5 @@ def _fitted(
         covariance * dependence,
         count,
         distance_m,
-        math.sqrt(float(fixes.variance[agree].mean())),
-        math.sqrt(float(fixes.yaw_variance[has_yaw].mean())) if has_yaw.any() else math.inf,
+        bool(has_yaw.any()),
     )

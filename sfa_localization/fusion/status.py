@@ -54,7 +54,10 @@ def status_of(belief: Belief, state: State | None, health: Health, config: Filte
     """The status of a belief with this state and health."""
     memory = belief.memory
     if state is None:
-        return Status(Level.UNINITIALISED, (_missing(belief),))
+        no_odometry = belief.odometry.stamp_ns is None
+        missing = 'no odometry and no images yet' if no_odometry else 'no usable image yet'
+        moving = 'images show no heading yet: drive on'
+        return Status(Level.UNINITIALISED, (moving if memory.images else missing,))
     lost = uncertainty(state, config)
     uncertain = _larger_stds(state, config.degraded_std, DEGRADED_YAW_RAD)
     degraded = [reason for reason in uncertain if reason not in lost] + health.problems
@@ -80,14 +83,6 @@ def _larger_stds(state: State, std_m: float, std_rad: float) -> list[str]:
     elif state.yaw_std > std_rad:
         reasons.append(f'heading known to {math.degrees(state.yaw_std):.0f} deg only')
     return reasons
-
-
-def _missing(belief: Belief) -> str:
-    if belief.memory.images:
-        return 'images show no heading yet: drive on'
-    if belief.odometry.stamp_ns is None:
-        return 'no odometry and no images yet'
-    return 'no usable image yet'
 
 
 def _silences(belief: Belief) -> list[str]:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.fusion.belief import Belief, Event
@@ -34,18 +35,23 @@ class Timeline:
 
     def __init__(self) -> None:
         self._behind = 0
-        self._leaps: list[tuple[int, int]] = []  # kind and stamp of messages in a row
+        # Messages in a row that leap ahead: kind, stamp, and what takes each once more.
+        self._leaps: list[tuple[int, int, Callable[[], object]]] = []
+        self._retaking = False
         self._other_clock, self._period_ns = (0, 0), 0
         # Odometry in a row that is no newer than what came before it: how many of its messages lie
         # among those, and the first and last stamp.
         self._again = 0, 0, 0
 
-    def require_order(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
+    def require_order(
+        self, stamp_ns: int, kind: int, history: History[Event, Belief], again: Callable[[], object]
+    ) -> None:
         """Raises DataError for a stamp ahead of those before, which would make what follows too
-        old, until FEW_AHEAD messages in a row are ahead. Odometry in order ends the row.
+        old, until FEW_AHEAD messages in a row are ahead: then calls `again` of those that waited.
+        Odometry in order ends the row.
         """
         newest_ns = history.newest_ns
-        if newest_ns is None or history.newest.odometry.stamp_ns is None:
+        if newest_ns is None or history.newest.odometry.stamp_ns is None or self._retaking:
             return
         ahead_ns = stamp_ns - newest_ns
         if kind == MEASUREMENT:
@@ -59,10 +65,13 @@ class Timeline:
                 leap for leap in self._leaps if leap[0] != kind and leap[1] - stamp_ns <= far_ns
             ]
             return
-        self._leaps.append((kind, stamp_ns))
-        if len(self._leaps) < FEW_AHEAD:
+        if len(self._leaps) + 1 < FEW_AHEAD:
+            self._leaps.append((kind, stamp_ns, again))
             raise DataError(AHEAD)
-        self._period_ns, self._leaps = stamp_ns - self._leaps[-2][1], []
+        waiting, self._leaps, self._retaking = self._leaps, [], True
+        for *_, take in waiting:
+            take()
+        self._retaking, self._period_ns = False, stamp_ns - (history.newest_ns or stamp_ns)
 
     def require_place(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
         """Raises DataError for a stamp that cannot be used, and ClockWentBack."""

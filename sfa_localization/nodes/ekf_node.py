@@ -22,10 +22,10 @@ from std_srvs.srv import SetBool, Trigger
 from sfa_localization.data.errors import MessageError
 from sfa_localization.data.geometry import Array, compose, invert
 from sfa_localization.data.settings import Settings
+from sfa_localization.fusion.belief import Pose
 from sfa_localization.fusion.pose_filter import Level, PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import uncertainty
-from sfa_localization.fusion.track import Pose
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.discovery import Discovery
 from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, sensor_qos

@@ -38,12 +38,12 @@ def table(title, names, outputs_of):
     wrong, outputs, means, width = [], [], {}, max(map(len, names))
     tell(f'\nThrough {title}:\n\n{head(width)}')
     for name in names:
-        found, fault = outputs_of(name), {**FAULTS, **LIES}[name]
-        verdict = judge(found, fault.ends_s)
+        made, fault = outputs_of(name), {**FAULTS, **LIES}[name]
+        verdict = judge(made, fault.ends_s)
         tell(row(name, verdict, width))
         wrong += [] if name in LIES or fault.allows(verdict.false_s) else [f'{name}, {title}']
         means[name] = verdict.mean_m
-        outputs += found
+        outputs += made
     return wrong, outputs, means
 
 
@@ -82,7 +82,7 @@ def main():
         ('--live', 'also through the three nodes'),
         ('--lights', 'also in other lights and seasons'),
         ('--frozen', 'the filter alone, on what was recorded by day and in the evening'),
-        ('--means', 'the same; keep the mean errors, which test_frozen.py lets get no worse'),
+        ('--means', 'the same; keep the mean errors, which test_faults.py lets get no worse'),
         ('--page', 'only write the faults of promises.py into test/README.md'),
         ('--record', 'locate all images anew: after training, features or keyframes change'),
     ):
@@ -97,9 +97,9 @@ def main():
     everything, wrong, means = [], [], {}
     lies = [*LIES] if options.frozen or options.means else []
     for title, outputs_of in ways(options):
-        refused, outputs, found = table(title, options.faults or [*FAULTS, *lies], outputs_of)
+        refused, outputs, errors = table(title, options.faults or [*FAULTS, *lies], outputs_of)
         everything, wrong = everything + outputs, wrong + refused
-        means[title] = {name: found[name] for name in found if name in FAULTS}
+        means[title] = {name: errors[name] for name in errors if name in FAULTS}
     if options.means:
         frozen.keep(means)
     tell(f'\n{summary(everything)}\n')

@@ -31,7 +31,7 @@ STANDING_HZ = 5
 """Rate of pictures where the robot stands."""
 LAP = 0.5
 """Of the drive, which is two laps."""
-ONE_IMAGE_S = 0.25
+IMAGE_PERIOD_S = 0.25
 """By rounding, another machine may reject an image earlier or later."""
 SLIP_S, DARK_S, CARRIED_S = 8.0, 4.0, 9.0
 """How long wheels slip, and a kidnapped robot sees nothing; it is put down where it would have been
@@ -50,7 +50,7 @@ class Fault:
 
     def allows(self, false_s):
         """Whether so many seconds LOCALISED and wrong are not too long."""
-        return false_s <= (self.allowed_s + ONE_IMAGE_S if self.allowed_s else 0.0)
+        return false_s <= (self.allowed_s + IMAGE_PERIOD_S if self.allowed_s else 0.0)
 
     def messages(self, drive):
         """The messages in the order in which they arrive."""
@@ -111,8 +111,8 @@ def doubled(message, *_):
 
 def bundled(message, *_):
     """Sent, and stamped, together with all of the same 40 ms, hardly apart."""
-    left_ns = -message.stamp_ns % (SECOND_NS // 25)
-    at_ns = message.stamp_ns + left_ns - left_ns // 40
+    wait_ns = -message.stamp_ns % (SECOND_NS // 25)
+    at_ns = message.stamp_ns + wait_ns - wait_ns // 40
     return [message._replace(at_ns=at_ns, stamp_ns=at_ns)]
 
 
@@ -188,9 +188,9 @@ def frozen(std, step=0, gain=0.0):
 def hidden(image, share, begin):
     """Where (H, W, 1) a part of a panorama is hidden: 1, else 0."""
     height, width = image.shape[:2]
-    found = np.zeros((height, width, 1), np.float32)
-    found[:, int(begin * width) : int((begin + share) * width)] = 1.0
-    return found
+    mask = np.zeros((height, width, 1), np.float32)
+    mask[:, int(begin * width) : int((begin + share) * width)] = 1.0
+    return mask
 
 
 def blackened(share, begin):
@@ -424,8 +424,8 @@ def looped(from_s, length_s):
         images = [m for m in drive.messages if isinstance(m.content, Seen)]
         at_s = np.array([(m.at_ns - drive.start_ns) / SECOND_NS for m in images])
         again_s = from_s - length_s + (at_s - from_s) % length_s
-        shown = np.where(at_s < from_s, np.arange(len(images)), np.searchsorted(at_s, again_s))
-        contents = iter([images[i].content for i in shown])
+        repeated = np.where(at_s < from_s, np.arange(len(images)), np.searchsorted(at_s, again_s))
+        contents = iter([images[i].content for i in repeated])
         made = changed(Seen, lambda m, *_: [m._replace(content=next(contents))], 0.0, NEVER)
         return made(drive, rng)
 

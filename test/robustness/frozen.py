@@ -42,8 +42,8 @@ class FilterInput:
 class Recorder(Robot):
     """Notes what would reach the filter."""
 
-    def __init__(self, *known):
-        super().__init__(*known)
+    def __init__(self, *learned):
+        super().__init__(*learned)
         self.messages = []
 
     def drive(self, message):
@@ -75,8 +75,8 @@ def record(tell):
             arrays.update(packed(f'{light[0]}/{name}', robot.messages, world.start_ns))
             tell(f'{light[0]}: {name}')
         correlation = model().error_correlation
-        known = [correlation.share, correlation.distance_m, model().rig.camera_delay.value]
-        arrays[light[0]] = np.array([*known, *astuple(to_truth())])
+        learned = [correlation.share, correlation.distance_m, model().rig.camera_delay.value]
+        arrays[light[0]] = np.array([*learned, *astuple(to_truth())])
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     FILE.write_bytes(lzma.compress(buffer.getvalue(), preset=9 | lzma.PRESET_EXTREME))
@@ -118,13 +118,13 @@ class Frozen:
             for kind, at_ns, stamp_ns in zip(kinds, *(times + start_ns).tolist(), strict=True)
         ]
         share, distance_m, delay_s, *transform = self._arrays[light].tolist()
-        known = SimpleNamespace(
+        learned = SimpleNamespace(
             error_correlation=ErrorCorrelation(share, distance_m),
             rig=Rig(camera_delay=Quantity(delay_s, 0.05)),
             panorama=PanoramaConfig(),
             keyframes=None,
         )
-        return FilterInput(messages, int(start_ns), known, RigidTransform(*transform))
+        return FilterInput(messages, int(start_ns), learned, RigidTransform(*transform))
 
 
 def unpacked(kind, at_ns, stamp_ns, values):

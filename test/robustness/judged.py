@@ -65,11 +65,11 @@ def judge(outputs, ends_s):
     """The row of a fault that ends after so many seconds of the drive."""
     if not outputs:
         return Verdict(math.nan, math.nan, 0.0, 0.0, recovery_s((), (), ends_s))
-    seconds = np.array([one.second for one in outputs])
+    seconds = np.array([said.second for said in outputs])
     lasted = np.diff(seconds, prepend=seconds[:1])
-    sure = np.array([one.level == 'LOCALISED' for one in outputs])
-    wrong = np.array([one.wrong for one in outputs])
-    errors = np.array([one.error_m for one in outputs])
+    sure = np.array([said.level == 'LOCALISED' for said in outputs])
+    wrong = np.array([said.wrong for said in outputs])
+    errors = np.array([said.error_m for said in outputs])
     times = lasted[sure & wrong].sum(), lasted[sure].sum()
     made = float(errors.max()), float(errors.mean()), *map(float, times)
     return Verdict(*made, recovery_s(seconds, sure & ~wrong, ends_s))
@@ -95,17 +95,17 @@ def head(width):
     return f'{"fault":{width}s}  max error  mean error  false LOCALISED  LOCALISED  right again'
 
 
-def row(name, one, width):
+def row(name, verdict, width):
     """A verdict as text."""
-    far, mean, again = (shown(*v) for v in ((one.max_m, 'm'), (one.mean_m, 'm'),
-                                            (one.recovered_s, 's')))  # fmt: skip
+    far, mean, again = (in_words(*v) for v in ((verdict.max_m, 'm'), (verdict.mean_m, 'm'),
+                                            (verdict.recovered_s, 's')))  # fmt: skip
     return (
-        f'{name:{width}s}  {far:>9s}  {mean:>10s}  {one.false_s:13.1f} s'
-        f'  {one.localised_s:7.1f} s  {again:>11s}'
+        f'{name:{width}s}  {far:>9s}  {mean:>10s}  {verdict.false_s:13.1f} s'
+        f'  {verdict.localised_s:7.1f} s  {again:>11s}'
     )
 
 
-def shown(value, unit):
+def in_words(value, unit):
     """Meters or seconds in words."""
     if not math.isfinite(value):
         return '-' if math.isnan(value) else 'never'
@@ -116,11 +116,14 @@ def summary(outputs):
     """A line for each state: its seconds, its errors, and the share that its claims hold."""
     rows = [f'{"state":10s}   share  95 % of errors below  wrong  within 95 % (position, heading)']
     for level in ('LOCALISED', 'DEGRADED', 'LOST'):
-        mine = [one for one in outputs if one.level == level]
+        mine = [said for said in outputs if said.level == level]
         if not mine:
             continue
         error, std, yaw, yaw_std, wrong = np.transpose(
-            [(one.error_m, one.std_m, one.yaw_deg, one.yaw_std_deg, one.wrong) for one in mine]
+            [
+                (said.error_m, said.std_m, said.yaw_deg, said.yaw_std_deg, said.wrong)
+                for said in mine
+            ]
         )
         within = np.mean(error <= WITHIN_95[0] * std), np.mean(yaw <= WITHIN_95[1] * yaw_std)
         rows.append(

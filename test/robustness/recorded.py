@@ -69,9 +69,9 @@ class RecordedDrive:
         for step in self.steps[1:]:
             poses.append(compose(poses[-1], step))
         said = zip(self.times_ns, poses, self.twists, self.variances, self.true, strict=True)
-        found = [Message(int(t), int(t), Reading(*values), true) for t, *values, true in said]
+        readings = [Message(int(t), int(t), Reading(*values), true) for t, *values, true in said]
         seen = zip(self.pictures_ns.tolist(), self.pictures, strict=True)
-        return found + [Message(t, t, Picture(image)) for t, image in seen]
+        return readings + [Message(t, t, Picture(image)) for t, image in seen]
 
     def seconds(self, times_ns):
         """Seconds since the begin."""
