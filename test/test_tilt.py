@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres, alone, recipe, run_in, wander
-from test_keyframes import HOME, drive, errors, fitted, known, unseen
+from test_keyframes import HOME, drive, errors, familiar, keyframes_of, unseen
 
 from sfa_localization.camera.leveling import NEAR_NS, leveled, tilted, tilts_at
 from sfa_localization.camera.settings import PanoramaConfig
@@ -104,7 +104,7 @@ def swayed(images: np.ndarray, degrees: float, seed: int, sphere: Sphere = SPHER
 def learnt(degrees: float) -> Keyframes:
     """Keyframes of such a robot."""
     images, _ = swayed(HOME.panoramas(drive(), config()), degrees, 0)
-    return fitted([images], [drive()], [0], config())
+    return keyframes_of([images], [drive()], [0], config())
 
 
 def errors_of_unseen(keyframes: Keyframes, degrees: float):
@@ -122,7 +122,7 @@ def test_a_tilted_image_stays_where_it_is_and_is_known(degrees):
     assert off.mean() < 1.5 * flat.mean() + 0.01
     assert swung.mean() < turned.mean() + np.radians(0.3)
     assert np.degrees(np.median(rest)) < 0.5
-    assert all(map(known, locations))
+    assert all(map(familiar, locations))
 
 
 @pytest.mark.parametrize('degrees', [(12, 2), (-3, 11)])
