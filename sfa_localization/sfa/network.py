@@ -177,20 +177,8 @@ def folded(solution: Solution) -> tuple[Weights, Weights]:
 
 def expand(z: Map) -> Map:
     """All monomials of degree 1 and 2 of signals (L, ...): (L + L (L + 1) / 2, ...)."""
-    n = len(z)
-    out = np.empty((n + n * (n + 1) // 2, *z.shape[1:]), z.dtype)
-    expand_into(z, out)
-    return out
-
-
-def expand_into(z: Map, out: Map) -> None:
-    """Write the monomials of z (L, ...) into `out`."""
-    n = len(z)
-    out[:n] = z
-    at = n
-    for i in range(n):
-        np.multiply(z[i:], z[i], out=out[at : at + n - i])
-        at += n - i
+    i, j = np.triu_indices(len(z))
+    return np.concatenate([z, z[i] * z[j]])
 
 
 def input_map(images: Image, architecture: Architecture) -> Map:
@@ -235,18 +223,7 @@ def resampled(image: Image, grid: tuple[int, int]) -> Image:
 
 
 def _unnormalized(image: Image) -> Map:
-    channels = image.shape[2]
-    return _affine(image, np.full(channels, 1 / 128), np.full(channels, -1.0))
-
-
-def _affine(image: Image, gain: Array, offset: Array) -> Map:
-    """image * gain + offset, both per channel (C,): (H, W, C) float32."""
-    rows, columns, _ = image.shape
-    out = np.multiply(
-        image.reshape(rows, -1), np.tile(gain.astype(np.float32), columns), dtype=np.float32
-    )
-    out += np.tile(offset.astype(np.float32), columns)
-    return out.reshape(image.shape)
+    return np.asarray(image / np.float32(128) - 1, np.float32)
 
 
 def _gray(image: Image) -> Map:
@@ -255,9 +232,9 @@ def _gray(image: Image) -> Map:
 
 def _per_panorama(image: Image) -> Map:
     """Zero mean and unit scale of each channel over the whole image: independent of exposure."""
-    mean, std = (np.asarray(part).ravel() for part in cv2.meanStdDev(image))
-    gain = 1 / np.maximum(std, 1.0)
-    return _affine(image, gain, -mean * gain)
+    pixels = np.asarray(image, np.float32)
+    scale = np.maximum(pixels.std((0, 1)), 1)
+    return np.asarray((pixels - pixels.mean((0, 1))) / scale, np.float32)
 
 
 _NORMALIZATIONS = {
@@ -270,21 +247,8 @@ NORMALIZATIONS = tuple(_NORMALIZATIONS)
 
 def linear_stage(below: Map, receptive: Field, linear: Weights, offset: Weights) -> Map:
     """First half of a layer: reduced signals (L, rows, R) of one map (rows, R, channels)."""
-    fields = unfold(below[None], receptive)[0]
-    # Of rows that overlap in memory, NumPy 1 makes a product without BLAS, in 40 times as long.
-    rows = np.ascontiguousarray(fields.reshape(-1, fields.shape[-1]))
-    reduced = rows @ linear - offset
-    return np.ascontiguousarray(reduced.T).reshape(-1, *fields.shape[:2])
-
-
-def slow_stage(reduced: Map, node: Node, clip: float, out: Map) -> None:
-    """Second half: slow features of reduced signals (L, rows, R) into (rows, R, K), clipped."""
-    expanded = expand(reduced.reshape(len(reduced), -1))
-    slow = out.reshape(-1, out.shape[-1])
-    np.matmul(expanded.T, node.slow, out=slow)
-    slow -= node.slow_offset
-    np.minimum(slow, np.float32(clip), out=slow)
-    np.maximum(slow, np.float32(-clip), out=slow)
+    reduced = unfold(below[None], receptive)[0] @ linear - offset
+    return np.asarray(np.moveaxis(reduced, -1, 0), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,13 +267,12 @@ class Network:
         """Output map of layer `depth` (0-based) from the map below."""
         node, layer = self.nodes[depth], self.architecture.layers[depth]
         receptive = self.architecture.fields[depth]
-        count, rows, columns, _ = maps.shape
-        out = np.empty((count, receptive.rows_out(rows), columns, layer.outputs), np.float32)
-        # One image at a time: its signals stay in the processor's cache.
-        for below, above in zip(maps, out, strict=True):
+        above = []
+        for below in maps:  # the monomials of all images at once would need much memory
             reduced = linear_stage(below, receptive, node.linear, node.linear_offset)
-            slow_stage(reduced, node, layer.clip, above)
-        return out
+            slow = np.moveaxis(expand(reduced), 0, -1) @ node.slow - node.slow_offset
+            above.append(np.clip(slow, -layer.clip, layer.clip))
+        return np.stack(above)
 
     def maps(self, images: Image) -> list[Map]:
         """Every layer's output map (T, rows, R, outputs) for panoramas (T, H, W, C)."""

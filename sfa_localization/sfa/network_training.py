@@ -26,7 +26,7 @@ from sfa_localization.sfa.network import (
     Architecture,
     Network,
     Node,
-    expand_into,
+    expand,
     folded,
     input_map,
     linear_stage,
@@ -221,12 +221,8 @@ def _signals(partial: Partial) -> Callable[[Map], Map]:
     linear, offset = folded(partial.linear)
 
     def expanded(maps: Map) -> Map:
-        dimensions = partial.architecture.layers[partial.depth].expanded
-        rows = receptive.rows_out(maps.shape[1])
-        out = np.empty((dimensions, len(maps), rows, maps.shape[2]), np.float32)
-        for t, below in enumerate(maps):
-            expand_into(linear_stage(below, receptive, linear, offset), out[:, t])
-        return out
+        reduced = [linear_stage(below, receptive, linear, offset) for below in maps]
+        return expand(np.stack(reduced, axis=1))
 
     return expanded
 
