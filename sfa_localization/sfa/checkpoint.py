@@ -20,7 +20,7 @@ from sfa_localization.data.files import is_regular
 from sfa_localization.data.run import Run
 from sfa_localization.sfa.network import Architecture, Node
 from sfa_localization.sfa.network_training import Partial
-from sfa_localization.sfa.slowness import Solution
+from sfa_localization.sfa.slowness import LinearSfa
 
 FORMAT = 'sfa_localization training checkpoint'
 VERSION = 1
@@ -84,7 +84,7 @@ class Checkpoint:
         linear = None
         if header['linear_rank'] is not None:
             mean, weights, delta = (arrays[f'linear/{n}'] for n in ('mean', 'weights', 'delta'))
-            linear = Solution(mean, weights, delta, int(header['linear_rank']))
+            linear = LinearSfa(mean, weights, delta, int(header['linear_rank']))
         return Partial(architecture, nodes, linear, deltas, ranks)
 
     def remove(self) -> None:

@@ -29,7 +29,7 @@ from sfa_localization.sfa.network_training import (
     shards_of,
 )
 from sfa_localization.sfa.rotation import Field
-from sfa_localization.sfa.slowness import Solution, signed, whitening
+from sfa_localization.sfa.slowness import LinearSfa, signed, whitening
 
 
 def train_network(
@@ -190,7 +190,7 @@ def network_of(flow: Any, architecture: Architecture) -> Network:
     """The trained weights of a flow as a network."""
     trained = [layer.node for layer in flow if layer.is_trainable()]
     solutions = [
-        Solution(node.avg, node.sf, node.d, node.input_dim - node.rank_deficit) for node in trained
+        LinearSfa(node.avg, node.sf, node.d, node.input_dim - node.rank_deficit) for node in trained
     ]
     pairs = list(zip(solutions[::2], solutions[1::2], strict=True))
     return Network(

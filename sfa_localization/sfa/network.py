@@ -21,7 +21,7 @@ from sfa_localization.data.errors import ConfigError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.sfa.rotation import Field, Map, unfold
-from sfa_localization.sfa.slowness import Solution
+from sfa_localization.sfa.slowness import LinearSfa
 
 Weights = NDArray[np.float32]
 
@@ -165,11 +165,11 @@ class Node:
     slow_offset: Weights
 
     @classmethod
-    def from_solutions(cls, linear: Solution, slow: Solution) -> Node:
+    def from_solutions(cls, linear: LinearSfa, slow: LinearSfa) -> Node:
         return cls(*folded(linear), *folded(slow))
 
 
-def folded(solution: Solution) -> tuple[Weights, Weights]:
+def folded(solution: LinearSfa) -> tuple[Weights, Weights]:
     """Weights (D, K) of a solution, and its mean as an offset (K,): x weights - offset."""
     weights = solution.weights.astype(np.float32)
     return weights, (solution.mean @ solution.weights).astype(np.float32)

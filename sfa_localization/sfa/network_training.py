@@ -32,7 +32,7 @@ from sfa_localization.sfa.network import (
     linear_stage,
 )
 from sfa_localization.sfa.rotation import FieldStatistics, Map, SampleStatistics, Sums
-from sfa_localization.sfa.slowness import Solution, Statistics, solve
+from sfa_localization.sfa.slowness import LinearSfa, Statistics, solve
 
 SHARD = 64
 """Images whose sums are computed by one task: enough for its products, few enough to balance."""
@@ -149,7 +149,7 @@ class Partial:
 
     architecture: Architecture
     nodes: tuple[Node, ...] = ()
-    linear: Solution | None = None
+    linear: LinearSfa | None = None
     deltas: tuple[NDArray[np.float64], ...] = field(default=())
     ranks: tuple[tuple[int, int], ...] = field(default=())
     rotate: bool = True

@@ -45,7 +45,7 @@ class Statistics:
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
+class LinearSfa:
     """Linear slow features s = (x - mean) weights, slowest first.
 
     `mean` (D,), `weights` (D, K), `delta` (K,) the Delta values <ds^2>, `rank` the number of
@@ -62,7 +62,7 @@ class Solution:
         return np.asarray((x - self.mean) @ self.weights)
 
 
-def solve(statistics: Statistics, outputs: int, relative_cut: float) -> Solution:
+def solve(statistics: Statistics, outputs: int, relative_cut: float) -> LinearSfa:
     """Slowest `outputs` directions of unit variance, decorrelated, in order of Delta.
 
     Directions whose variance is below `relative_cut` times the largest are dropped first (C is
@@ -85,7 +85,7 @@ def solve(statistics: Statistics, outputs: int, relative_cut: float) -> Solution
     slow = white.T @ (statistics.difference / statistics.steps) @ white
     delta, rotation = linalg.eigh((slow + slow.T) / 2, subset_by_index=[0, outputs - 1])
     weights = signed(white @ rotation)
-    return Solution(mean, weights, delta, rank)
+    return LinearSfa(mean, weights, delta, rank)
 
 
 def whitening(covariance: Array, relative_cut: float, least: int) -> Array:
