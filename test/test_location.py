@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """One mixture of hypotheses by keyframes, and of how wrong slow features may be."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sfa_localization.keyframes.errors import ErrorModel
-from sfa_localization.keyframes.location import SCALES, Hypothesis, Location, SlowPlace, located
+from sfa_localization.keyframes.location import SCALES, Location, located
 from sfa_localization.keyframes.regression import Fit
 
 STD = 0.1
@@ -24,9 +26,9 @@ def fit_at(x=0.0, y=0.0, yaw=0.0, unlike=0.1, outward=0.0, residual=None) -> Fit
 def locate(fits, slow=((0.0, 0.0),), std=1e3, scales=RIGHT, starts=None) -> Location:
     """By fits, each of its own start or of those given, and places (1 or N, 2) of slow features."""
     starts = range(len(fits)) if starts is None else starts
-    likely = [Hypothesis(fit, start) for fit, start in zip(fits, starts, strict=True)]
-    places = [SlowPlace(place, std**2) for place in np.broadcast_to(slow, (len(fits), 2))]
-    return located(likely, places, scales, ERRORS, np.zeros(2))
+    fits = [replace(fit, start=start) for fit, start in zip(fits, starts, strict=True)]
+    places = np.broadcast_to(slow, (len(fits), 2)), np.full(len(fits), std**2)
+    return located(fits, places, scales, ERRORS, np.zeros(2))
 
 
 def test_a_hypothesis_and_slow_features_are_fused_by_their_information():

@@ -19,7 +19,7 @@ from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.keyframes.errors import ErrorModel
 from sfa_localization.keyframes.light import Conditions
-from sfa_localization.keyframes.location import Hypothesis, SlowPlace, located
+from sfa_localization.keyframes.location import located
 from sfa_localization.localizer import Localizer, Observer, unusable_covariance
 from sfa_localization.place_model import PlaceModel
 
@@ -125,9 +125,8 @@ class Matched(PictureReader):
 
     def located(self, view, conditions):
         fit = fit_at([0.0, 0.0], 1 / (1 + self.unlike), variance=0.1**2, outward=0.2)
-        slow = SlowPlace(np.array([self.x, 0.0]), 0.1**2)
-        errors = self.keyframes.errors
-        return located([Hypothesis(fit, 0)], [slow], conditions.scales, errors, np.zeros(2))
+        slow = np.array([[self.x, 0.0]]), np.array([0.1**2])
+        return located([fit], slow, conditions.scales, self.keyframes.errors, np.zeros(2))
 
     observed = PlaceModel.observed
 
