@@ -7,12 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfa_localization.sfa.rotation import (
-    Field,
-    FieldStatistics,
-    SampleStatistics,
-    unfold,
-)
+from sfa_localization.sfa.rotation import Field, FieldStatistics, SampleStatistics, unfold
 from sfa_localization.sfa.slowness import Statistics
 
 FIELDS = (
@@ -105,10 +100,10 @@ def test_statistics_equal_brute_force(joined):
         assert np.array_equal(unfold(of, field), views(of, field).astype(np.float32))
     explicit = brute_force(turned.astype(np.float64), 12, joined)
     assert_equal(sample_statistics(of, joined), explicit)
-    one, none = of[:1], np.zeros(0, bool)  # a single picture turns, but does not move
-    explicit = brute_force(views(sequence(one), FIELDS[0]), 12, none)
-    assert_equal(field_statistics(one, FIELDS[0], none), explicit)
-    assert_equal(sample_statistics(one, none), brute_force(sequence(one), 12, none))
+    single, none = of[:1], np.zeros(0, bool)  # it turns, but does not move
+    explicit = brute_force(views(sequence(single), FIELDS[0]), 12, none)
+    assert_equal(field_statistics(single, FIELDS[0], none), explicit)
+    assert_equal(sample_statistics(single, none), brute_force(sequence(single), 12, none))
 
 
 def without_rotation(signals: np.ndarray, joined: np.ndarray) -> tuple[float, np.ndarray]:

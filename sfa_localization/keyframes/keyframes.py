@@ -16,13 +16,16 @@ from numpy.typing import NDArray
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.keyframes.correlation import COARSE, Scores, coarse, correlate
 from sfa_localization.keyframes.errors import ErrorModel
 from sfa_localization.keyframes.regression import Fit, regress
 from sfa_localization.keyframes.texture import (
+    COARSE,
+    Scores,
     Spectra,
     channels,
+    coarse,
     columns_of,
+    correlate,
     spectra_of,
     spectrum,
     turned,

@@ -13,9 +13,9 @@ from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.data.statistics import evenly
 from sfa_localization.keyframes.closures import STRETCH_M
-from sfa_localization.keyframes.correlation import LIKE_A_PLACE
 from sfa_localization.keyframes.keyframes import FEWEST, Keyframes
 from sfa_localization.keyframes.regression import BORDER, Fit
+from sfa_localization.keyframes.texture import LIKE_A_PLACE
 
 LEAST, DENSITY = 2000, 2
 """Keyframes of a model, 3 kB each: so many, or in large places so many per square meter. A third of
