@@ -143,7 +143,7 @@ SMALL_LAYERS = (
 )
 
 STANDARD_NETWORKS = {(30, 300): PAPER_LAYERS, (40, 320): SMALL_LAYERS}
-"""Grid -> layers; the first is for panoramas of all sizes but those of the others' grids."""
+"""Layers by grid; the first grid is for panoramas of all sizes that are not a grid themselves."""
 
 
 def standard_architecture(size: tuple[int, int], normalization: str) -> Architecture:
@@ -203,9 +203,8 @@ def require_size(images: Image, architecture: Architecture) -> None:
 
 
 def resampled(image: Image, grid: tuple[int, int]) -> Image:
-    """A panorama (H, W, C) at the size (rows, columns) of a grid; its ends belong together.
-
-    Pixels are averaged where they are too many, and interpolated where they are too few.
+    """A panorama (H, W, C), resampled to (rows, columns) and wrapped around at its ends: averaged
+    along an axis with more pixels than the grid, interpolated along one with fewer.
     """
     rows, columns = grid
     height, width = min(image.shape[0], rows), min(image.shape[1], columns)
@@ -285,7 +284,7 @@ class Network:
 
 
 def check_weights(network: Network) -> None:
-    """Require weights of the sizes that the architecture has. Raises ModelError."""
+    """Raise ModelError unless the weights have the sizes of the architecture."""
     architecture = network.architecture
     levels = zip(
         network.nodes,

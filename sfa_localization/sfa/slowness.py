@@ -74,28 +74,27 @@ def solve(statistics: Statistics, outputs: int, relative_cut: float) -> LinearSf
         raise DataError('SFA needs at least two consecutive samples')
     mean, covariance = statistics.covariance()
     white = whitening(covariance, relative_cut, outputs)
-    rank = white.shape[1]
-    if rank < outputs:
-        raise DataError(
-            f'the signal has rank {rank}, fewer than the {outputs} slow features asked for: '
-            'record more varied images or ask for fewer'
-        )
     from scipy import linalg  # for training alone
 
     slow = white.T @ (statistics.difference / statistics.steps) @ white
     delta, rotation = linalg.eigh((slow + slow.T) / 2, subset_by_index=[0, outputs - 1])
     weights = signed(white @ rotation)
-    return LinearSfa(mean, weights, delta, rank)
+    return LinearSfa(mean, weights, delta, white.shape[1])
 
 
 def whitening(covariance: Array, relative_cut: float, least: int) -> Array:
     """Matrix (D, rank) that makes the kept part of a signal of this covariance (D, D) white.
 
-    At least `least` directions are kept, unless they are rounding errors.
+    At least `least` directions are kept. Raises DataError where fewer are above rounding errors.
     """
     variance, axes = np.linalg.eigh(covariance)
     cut = min(relative_cut * variance[-1], variance[-min(least, len(variance))])
     kept = (variance >= cut) & (variance > max(_ROUNDING * variance[-1], np.finfo(float).tiny))
+    if kept.sum() < least:
+        raise DataError(
+            f'the signal has rank {kept.sum()}, fewer than the {least} slow features asked for: '
+            'record more varied images or ask for fewer'
+        )
     return np.asarray(axes[:, kept] / np.sqrt(variance[kept]))
 
 
