@@ -60,7 +60,7 @@ class Location:
 
 
 def hypotheses(
-    keyframes: Keyframes, image: UprightImage, pattern: Spectra | None = None
+    keyframes: Keyframes, image: UprightImage, pattern: Spectra | None
 ) -> tuple[list[Fit], Array]:
     """Where an image may have been taken, without the `pattern` (rows, F) of its light and without
     the tilt that the likeliest hypothesis finds; and its whole tilt, (2,) rad.

@@ -66,7 +66,7 @@ def find_offsets(views: Textures, poses: Array, sphere: Sphere) -> Offsets:
         near = near[~views.near(row, near)][:NEIGHBORS]
         if len(near) < FEWEST:
             continue
-        fit = keyframes.fit(keyframes.spectra([row])[0], poses[row, 2], near)
+        fit = keyframes.fit(keyframes.spectrum(row), poses[row, 2], near)
         if fit.unlike < _UNLIKE:
             shares, turn = np.zeros((2, NEIGHBORS))
             others = np.full(NEIGHBORS, near[0])

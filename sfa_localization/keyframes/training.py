@@ -71,7 +71,7 @@ def fit_among(keyframes: Keyframes, row: int, among: NDArray[np.bool_]) -> Fit |
     """The fit of a keyframe among others, by a mask (K,); None where it is like none of them, or
     they are too few.
     """
-    image, others = keyframes.spectra([row])[0], keyframes.take(among)
+    image, others = keyframes.spectrum(row), keyframes.take(among)
     if len(others.poses) < FEWEST:
         return None
     scores, yaws = others.correlated(image)
