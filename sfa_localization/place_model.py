@@ -25,14 +25,9 @@ from sfa_localization.data.run import Image
 from sfa_localization.data.threads import one_core
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.light import Conditions
-from sfa_localization.keyframes.location import (
-    Hypothesis,
-    Location,
-    SlowPlace,
-    hypotheses,
-    located,
-)
+from sfa_localization.keyframes.location import Location, hypotheses, located
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE, Observation
+from sfa_localization.keyframes.regression import Fit
 from sfa_localization.keyframes.upright import UprightImage, upright
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.turned_maps import TurnedMaps
@@ -109,23 +104,22 @@ class PlaceModel:
 
     def located(self, view: View, conditions: Conditions) -> Location:
         """Where the camera was, by keyframes and slow features in the current conditions."""
-        likely, tilt = hypotheses(self.keyframes, view.upright, conditions.pattern)
-        slow = self._slow_places(view, likely)
-        return located(likely, slow, conditions.scales, self.keyframes.errors, tilt)
+        fits, tilt = hypotheses(self.keyframes, view.upright, conditions.pattern)
+        slow = self._slow_places(view, fits)
+        return located(fits, slow, conditions.scales, self.keyframes.errors, tilt)
 
-    def _slow_places(self, view: View, likely: Sequence[Hypothesis]) -> list[SlowPlace]:
-        """Where the map puts an image at the heading of each hypothesis; the variance includes that
-        of the heading.
+    def _slow_places(self, view: View, fits: Sequence[Fit]) -> tuple[Array, Array]:
+        """Where the map puts an image at the heading of each of H hypotheses, (H, 2) m, and its
+        variances (H,) m^2 along each axis, which include that of the heading.
         """
         if self.turned is None:
-            places, covariances = self.metric.predict(view.slow_features)
-            return [SlowPlace(places[0], float(covariances[0, 0, 0]))] * len(likely)
-        yaw, unlike = np.array([(h.fit.yaw, h.fit.unlike) for h in likely]).T
+            place, covariance = self.metric.predict(view.slow_features)
+            return place.repeat(len(fits), axis=0), covariance[:, 0, 0].repeat(len(fits))
+        yaw, unlike = np.array([(fit.yaw, fit.unlike) for fit in fits]).T
         variance = self.keyframes.errors.yaw_variance(unlike)
         spectra = np.repeat(view.spectrum[None], len(yaw), axis=0)
         places, covariances, by_yaw = self.turned.predict(self.metric, spectra, yaw, variance)
-        variances = np.trace(covariances + by_yaw, axis1=1, axis2=2) / 2
-        return list(map(SlowPlace, places, variances.tolist()))
+        return places, np.trace(covariances + by_yaw, axis1=1, axis2=2) / 2
 
     def observed(self, view: View, location: Location) -> Observation:
         """The pose of base_link; its covariance includes the errors that all images share: those of

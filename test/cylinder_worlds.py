@@ -17,7 +17,7 @@ from sfa_localization.data.sphere import Sphere
 from sfa_localization.keyframes.errors import LeftOut
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.light import Conditions
-from sfa_localization.keyframes.location import SlowPlace, hypotheses, located
+from sfa_localization.keyframes.location import hypotheses, located
 from sfa_localization.keyframes.training import choose_keyframes, located_without
 from sfa_localization.keyframes.upright import upright
 from sfa_localization.metric.settings import MetricConfig
@@ -123,9 +123,9 @@ def learnt_keyframes(textures, poses, path_m, sphere: Sphere, drives) -> Keyfram
 def alone(keyframes: Keyframes, image: np.ndarray, conditions: Conditions | None = None):
     """The `Location` of an image (H, W, 3) by keyframes, without slow features."""
     conditions = conditions or Conditions()
-    likely, tilt = hypotheses(keyframes, upright(keyframes, image), conditions.pattern)
-    unknown = [SlowPlace(one.fit.place, 1e6) for one in likely]
-    return located(likely, unknown, conditions.scales, keyframes.errors, tilt)
+    fits, tilt = hypotheses(keyframes, upright(keyframes, image), conditions.pattern)
+    unknown = np.array([fit.place for fit in fits]), np.full(len(fits), 1e6)
+    return located(fits, unknown, conditions.scales, keyframes.errors, tilt)
 
 
 PLACE_SIZE = (12, 72)

@@ -45,7 +45,7 @@ def test_a_signal_leaves_no_images(number, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_machine_is_one_line(capsys):
+def test_a_full_machine_is_a_single_line(capsys):
     def fail(error) -> int:
         raise error
 
@@ -58,7 +58,7 @@ def test_a_full_machine_is_one_line(capsys):
         assert capsys.readouterr() == ('', f'error: {why}\n')
 
 
-def test_reasons_are_counted_apart_up_to_a_number_and_then_together():
+def test_reasons_are_counted_singly_up_to_a_number_and_then_together():
     """What senders write can fill neither the memory nor the diagnostics."""
     reasons = RejectionCounter()
     for k in range(3000):

@@ -53,29 +53,28 @@ def views(world: Spheres, drives: list[np.ndarray], config: PanoramaConfig, gamm
     for number, poses in enumerate(drives):
         images = world.panoramas(poses, config)
         lit = 255 * (images / 255) ** (gamma if number else 1.0)
-        textures += [quantized(texture(image)[None]) for image in lit.astype(np.uint8)]
+        textures += [texture(image) for image in lit.astype(np.uint8)]
         steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
         parts.append(np.cumsum(steps))
     count = sum(len(poses) for poses in drives)
     run = np.repeat(np.arange(len(drives)), [len(poses) for poses in drives])
-    return Textures(np.concatenate(textures), np.arange(count), run, np.concatenate(parts))
+    return Textures(quantized(np.stack(textures)), np.arange(count), run, np.concatenate(parts))
 
 
 @pytest.mark.parametrize('config', [CONFIG, COUNTER])
-def test_closures_are_of_one_place_and_know_the_turn(config):
+def test_closures_are_of_the_same_place_and_measure_the_turn(config):
     poses = [wander(250, 0), wander(200, 1)]
     seen = views(Spheres.about(0), poses, config, gamma=1.8)
     closures = find_closures(seen, config.clockwise)
     true = np.concatenate(poses)
     first, second = closures.images.T
-    between = first < 250
-    between &= second >= 250
+    between = (first < 250) & (second >= 250)
     assert between.sum() > 20
     assert (np.hypot(*(true[first] - true[second])[:, :2].T) < 0.5).mean() > 0.93
     error = np.abs(wrap_angle(true[second, 2] - true[first, 2] - closures.turn))
     assert np.median(error) < np.radians(1.5)
-    own = ~between
-    assert (np.abs(seen.path_m[first] - seen.path_m[second])[own] >= STRETCH_M).all()
+    way = np.abs(seen.path_m[first] - seen.path_m[second])
+    assert (way[~between] >= STRETCH_M).all()
     assert len({tuple(pair) for pair in closures.images.tolist()}) == len(closures)
 
 
@@ -177,16 +176,16 @@ def test_the_form_is_the_sum_of_the_weighted_squares():
 def test_offsets_hold_in_any_frame():
     drives = [wander(250, 0), wander(200, 1)]
     seen, poses = views(Spheres.about(0), drives, CONFIG), np.concatenate(drives)
-    found = find_offsets(seen, poses, CONFIG.sphere)
-    assert len(found.images) > 20
-    mixed = (found.shares[:, :, None] * poses[found.others, :2]).sum(1)
-    assert np.median(np.hypot(*(mixed - poses[found.images, :2]).T)) < 0.05
-    turn = wrap_angle(poses[found.images, None, 2] - poses[found.others, 2] - found.turn)
+    offsets = find_offsets(seen, poses, CONFIG.sphere)
+    assert len(offsets.images) > 20
+    mixed = (offsets.shares[:, :, None] * poses[offsets.others, :2]).sum(1)
+    assert np.median(np.hypot(*(mixed - poses[offsets.images, :2]).T)) < 0.05
+    turn = wrap_angle(poses[offsets.images, None, 2] - poses[offsets.others, 2] - offsets.turn)
     assert np.median(np.abs(turn)) < np.radians(1.0)
     moved = RigidTransform(3.0, -1.0, 0.7)
     elsewhere = np.column_stack([moved.apply(poses[:, :2]), poses[:, 2] + moved.yaw_rad])
     same = find_offsets(seen, elsewhere, CONFIG.sphere)
-    assert np.array_equal(same.images, found.images)
+    assert np.array_equal(same.images, offsets.images)
     again = (same.shares[:, :, None] * poses[same.others, :2]).sum(1)
     np.testing.assert_allclose(again, mixed, atol=0.01)
 

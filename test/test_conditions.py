@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recent conditions: what the light adds to all images, and how wrong slow features are."""
+"""Conditions of the latest images: what the light adds, and how wrong slow features are."""
 
 from functools import cache
 
@@ -31,7 +31,7 @@ def sunny(poses, config, share=0.3):
 
 @cache
 def drive(light, config=CONFIG, **share):
-    """Locations of 110 images in a light, without and with what others before show of it, the
+    """Locations of 110 images in a light, without and with the conditions by earlier images; the
     poses, and the conditions.
     """
     keyframes, conditions = learnt(Spheres.about(1), config), Conditions()
@@ -69,7 +69,7 @@ def seen(x, residual, outward=0.2) -> Location:
 
 
 def test_the_pattern_is_a_mean_over_places():
-    """What changed at a single place, as a visitor there, does not change the pattern."""
+    """What is unusual about a single place, as a visitor there, hardly changes it."""
     share, rng, conditions = np.ones((3, 4)), np.random.default_rng(0), Conditions()
     conditions.add(seen(0.0, share))
     once = conditions.pattern.copy()
@@ -82,14 +82,14 @@ def test_the_pattern_is_a_mean_over_places():
     assert np.all(conditions.pattern.real > once.real)
     conditions = Conditions()
     for k in range(300):
-        pattern = 0.0 if conditions.pattern is None else conditions.pattern
-        conditions.add(seen(0.3 * k, share + rng.normal(0, 1.0, share.shape) - pattern))
+        before = 0.0 if conditions.pattern is None else conditions.pattern
+        conditions.add(seen(0.3 * k, share + rng.normal(0, 1.0, share.shape) - before))
     assert np.abs(conditions.pattern.mean() - 1) < 0.15
     assert np.std(conditions.pattern) < 0.3
 
 
 @pytest.mark.parametrize('claimed', [0.05, 0.1, 0.3])
-def test_slow_features_count_by_how_wrong_they_are_of_late(claimed):
+def test_slow_features_count_by_their_latest_errors(claimed):
     conditions, rng = Conditions(), np.random.default_rng(0)
     for wrong, least, most in ((1.0, 1.0, 1.5), (10.0, 6.0, 15.0), (1.0, 1.0, 1.5)):
         for _ in range(60):

@@ -12,17 +12,8 @@ from test_rotation import brute_force, views
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.sfa import network_training as hierarchy
-from sfa_localization.sfa.network import (
-    Network,
-    Node,
-    expand,
-    input_map,
-)
-from sfa_localization.sfa.network_training import (
-    ImageSequence,
-    shards_of,
-    train_network,
-)
+from sfa_localization.sfa.network import Network, Node, expand, input_map
+from sfa_localization.sfa.network_training import ImageSequence, shards_of, train_network
 from sfa_localization.sfa.slowness import solve
 
 CUT = 1e-7
@@ -63,6 +54,12 @@ def correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs((a * b).sum(0)) / norms)
 
 
+def assert_alike(maps, other_maps, least=0.99999):
+    """That the channels of all layers are the same up to sign."""
+    for depth, pair in enumerate(zip(maps, other_maps, strict=True)):
+        assert correlations(*pair).min() > least, f'layer {depth + 1}'
+
+
 @pytest.mark.parametrize('broken', [False, True])
 def test_features_equal_those_of_the_explicit_sequence(broken):
     of = drive(24)
@@ -70,8 +67,7 @@ def test_features_equal_those_of_the_explicit_sequence(broken):
         of.joined[[7, 15]] = False
     images = of.panoramas.read(0, 24)
     ours, theirs = trained(of).maps(images), explicit_network(of).maps(images)
-    for depth, (one, other) in enumerate(zip(ours, theirs, strict=True)):
-        assert correlations(one, other).min() > 0.9999, f'layer {depth + 1}'
+    assert_alike(ours, theirs, 0.9999)
 
 
 def test_shards_equal_the_whole(monkeypatch):
@@ -79,8 +75,7 @@ def test_shards_equal_the_whole(monkeypatch):
     whole = trained(of)
     monkeypatch.setattr(hierarchy, 'SHARD', 7)
     images = of.panoramas.read(0, 40)
-    for one, other in zip(whole.maps(images), trained(of).maps(images), strict=True):
-        assert correlations(one, other).min() > 0.99999
+    assert_alike(whole.maps(images), trained(of).maps(images))
 
 
 def test_drives_do_not_touch():
@@ -91,13 +86,12 @@ def test_drives_do_not_touch():
         ImageSequence(PanoramaArray(stamps[cut], images[cut]), np.ones(11, bool))
         for cut in (slice(0, 12), slice(12, 24))
     ]
-    apart = trained(*parts)
+    separate = trained(*parts)
     joined = np.ones(23, bool)
     joined[11] = False
     broken = trained(ImageSequence(both.panoramas, joined))
-    for one, other in zip(apart.maps(images), broken.maps(images), strict=True):
-        assert correlations(one, other).min() > 0.99999
-    assert not np.allclose(apart.nodes[0].linear, trained(both).nodes[0].linear, atol=1e-4)
+    assert_alike(separate.maps(images), broken.maps(images))
+    assert not np.allclose(separate.nodes[0].linear, trained(both).nodes[0].linear, atol=1e-4)
 
 
 def test_stages_resumed_give_the_same_bytes():

@@ -57,7 +57,7 @@ def fit_among(image, keyframes, places, columns, channels=None, drives=None) -> 
 
 
 @SIZES
-def test_a_place_between_keyframes_is_found_and_a_rest_of_angle_is_no_matter_of_it(columns):
+def test_a_place_between_keyframes_is_measured_whatever_the_rest_of_the_angle(columns):
     scene = KeyframeSquare(columns)
     for place in ((0.0, 0.0), (0.2, -0.3), (-0.4, 0.4)):
         fit = scene.fit(place)

@@ -40,18 +40,23 @@ def sunny(images: np.ndarray) -> np.ndarray:
     return (255 * (bright / 255) ** 1.6).astype(np.uint8)
 
 
-def fitted(parts, poses, numbers, config=CONFIG) -> Keyframes:
+def textures_of(images: np.ndarray) -> np.ndarray:
+    return quantized(np.stack([texture(image) for image in images]))
+
+
+def keyframes_of(parts, poses, numbers, config=CONFIG) -> Keyframes:
     """Keyframes of drives with images (N, H, W, 3), poses (N, 3) and a number each."""
-    textures = [quantized(np.stack([texture(image) for image in images])) for images in parts]
-    steps = [np.hypot(*np.diff(at[:, :2], axis=0, prepend=at[:1, :2] - 1000).T) for at in poses]
     drives = np.repeat(numbers, [len(at) for at in poses]).astype(np.int32)
-    textures, poses, steps = map(np.concatenate, (textures, poses, steps))
-    return learnt_keyframes(textures, poses, np.cumsum(steps), config.sphere, drives)
+    textures, poses = np.concatenate([*map(textures_of, parts)]), np.concatenate(poses)
+    return choose_keyframes(textures, poses, config.sphere, drives)[0]
 
 
 @cache
 def learnt(world: Spheres, config: PanoramaConfig = CONFIG) -> Keyframes:
-    return fitted([world.panoramas(drive(), config)], [drive()], [0], config)
+    poses = drive()
+    path = np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T))
+    textures = textures_of(world.panoramas(poses, config))
+    return learnt_keyframes(textures, poses, path, config.sphere, np.zeros(len(poses), np.int32))
 
 
 def unseen(number: int = 60) -> np.ndarray:
@@ -76,17 +81,17 @@ def errors_at(poses: np.ndarray, world=HOME, config=CONFIG, change=lambda images
 
 def within(locations: list[Location], poses: np.ndarray) -> float:
     """The share of locations whose ellipse of 95 % holds the pose of (N, 3)."""
-    apart = np.array([one.pose for one in locations])[:, :2] - poses[:, :2]
-    inverse = np.linalg.inv([one.covariance[:2, :2] for one in locations])
-    return float((np.einsum('ni,nij,nj->n', apart, inverse, apart) < 5.99).mean())
+    error = np.array([location.pose for location in locations])[:, :2] - poses[:, :2]
+    inverse = np.linalg.inv([location.covariance[:2, :2] for location in locations])
+    return float((np.einsum('ni,nij,nj->n', error, inverse, error) < 5.99).mean())
 
 
 def stds(locations: list[Location]) -> np.ndarray:
     """Standard deviations (N,) m along each axis."""
-    return np.sqrt([np.trace(one.covariance[:2, :2]) / 2 for one in locations])
+    return np.sqrt([np.trace(location.covariance[:2, :2]) / 2 for location in locations])
 
 
-def known(location: Location) -> bool:
+def familiar(location: Location) -> bool:
     return location.fit.explained >= WatchConfig().least_explained
 
 
@@ -103,15 +108,7 @@ def test_the_ellipses_hold_what_they_promise_also_where_a_part_is_covered(seed, 
     mask, poses = (np.arange(CONFIG.width) >= covered)[:, None], unseen(number)
     far, _, locations = errors_at(poses, Spheres.about(seed), change=lambda images: images * mask)
     assert within(locations, poses) > 0.85 and np.median(far) < 0.6
-    assert np.mean([*map(known, locations)]) > (0.8 if covered == 60 else 0.99)
-
-
-def test_a_turn_of_the_robot_is_a_turn_of_the_pose(columns=7):
-    keyframes, turn = learnt(HOME), 2 * np.pi * columns / CONFIG.width
-    for image in HOME.panoramas(unseen(8), CONFIG):
-        plain, turned = alone(keyframes, image), alone(keyframes, np.roll(image, columns, axis=1))
-        assert np.allclose(turned.pose[:2], plain.pose[:2], atol=0.1)
-        assert abs(wrap_angle(turned.pose[2] - plain.pose[2] - turn)) < np.radians(1.5)
+    assert np.mean([*map(familiar, locations)]) > (0.8 if covered == 60 else 0.99)
 
 
 LIGHTS = {
@@ -134,83 +131,83 @@ def test_light_does_not_matter(light):
 
 
 STRANGE = {
-    'foreign': lambda images: Spheres.about(9).panoramas(unseen(30), CONFIG),
+    'foreign': lambda images: Spheres.about(9).panoramas(unseen(20), CONFIG),
     'mirrored': lambda images: images[:, :, ::-1],
-    'upside down': lambda images: images[:, ::-1],
     'noise': lambda images: np.random.default_rng(5).integers(0, 255, images.shape),
     'black': np.zeros_like,
-    'gray': lambda images: np.full_like(images, 128),
 }
 
 
 @pytest.mark.parametrize('kind', STRANGE)
 def test_what_was_never_seen_is_not_believed(kind):
-    _, _, locations = errors_at(unseen(30), change=STRANGE[kind])
-    assert all(np.isfinite([*one.pose, *one.covariance.ravel()]).all() for one in locations)
-    sure = [known(one) and std < 0.3 for one, std in zip(locations, stds(locations), strict=True)]
+    _, _, locations = errors_at(unseen(20), change=STRANGE[kind])
+    for location in locations:
+        assert np.isfinite([*location.pose, *location.covariance.ravel()]).all()
+    sure = np.array([*map(familiar, locations)]) & (stds(locations) < 0.3)
     assert np.mean(sure) < 0.1
 
 
 def test_a_symmetric_world_is_ambiguous():
     """Places that look alike are uncertain; in the middle, where four headings do, the heading."""
-    world, poses = Spheres.about(2).symmetric(), unseen(20)
+    world, poses = Spheres.about(2).symmetric(), unseen(12)
     keyframes = replace(learnt(world), errors=ErrorModel())
     _, _, locations = errors(keyframes, world.panoramas(poses, CONFIG), poses)
     assert np.mean(stds(locations) > 0.5) > 0.7
     poses *= np.array([0.05, 0.05, 1.0])
     _, _, locations = errors(keyframes, world.panoramas(poses, CONFIG), poses)
     assert np.mean(stds(locations) < 0.3) > 0.9
-    assert all(one.covariance[2, 2] > 1.0 for one in locations)
+    assert all(location.covariance[2, 2] > 1.0 for location in locations)
 
 
 def test_they_are_saved_and_read():
-    one = learnt(HOME)
-    drives = np.arange(len(one.poses), dtype=np.int32) % 3
-    for keyframes in (one, replace(one, drives=drives, trained=2)):
-        again = Keyframes.from_arrays(keyframes.to_arrays(), keyframes.sphere)
-        assert np.array_equal(again.first, keyframes.first) and again.errors == keyframes.errors
-        for image in HOME.panoramas(unseen(5), CONFIG):
-            a, b = alone(keyframes, image), alone(again, image)
-            assert np.array_equal(a.pose, b.pose) and np.array_equal(a.covariance, b.covariance)
+    drives = np.arange(len(learnt(HOME).poses), dtype=np.int32) % 3
+    keyframes = replace(learnt(HOME), drives=drives, trained=2)
+    again = Keyframes.from_arrays(keyframes.to_arrays(), keyframes.sphere)
+    assert np.array_equal(again.first, keyframes.first) and again.errors == keyframes.errors
+    for image in HOME.panoramas(unseen(5), CONFIG):
+        a, b = alone(keyframes, image), alone(again, image)
+        assert np.array_equal(a.pose, b.pose) and np.array_equal(a.covariance, b.covariance)
 
 
-def test_drives_in_one_light_are_one_and_those_in_another_are_not():
-    """Together the drives in one light are nearer to any place, and locate it better."""
+@pytest.mark.parametrize('lit', [(0,), (1,), ()])
+def test_drives_in_the_same_light_get_one_number(lit):
+    """Together they are nearer to any place, and locate images better."""
     poses = [drive(0.5) + np.array([step, step, 0.0]) for step in (0.0, 0.13, 0.27)]
-    plain = [HOME.panoramas(at, CONFIG) for at in poses]
-    lit, images = sunny(plain[1]), HOME.panoramas(unseen(), CONFIG)
-    for parts, numbers in (
-        ([plain[0], lit, plain[2]], [0, 1, 0]),
-        ([lit, plain[1], plain[2]], [0, 1, 1]),
-        (plain, [0, 0, 0]),
-    ):
-        keyframes = fitted(parts, poses, [3, 5, 7])
-        assert keyframes.drives.tolist() == np.repeat(numbers, len(poses[0])).tolist()
-        assert keyframes.first.all() and keyframes.trained == max(numbers) + 1
-    off, turned, _ = errors(keyframes, images, unseen())
-    worse, *_ = errors(fitted(plain[:1], poses[:1], [0]), images, unseen())
-    assert off.mean() < min(worse.mean(), 0.1) and np.degrees(turned.mean()) < 1.0
+    parts = [HOME.panoramas(at, CONFIG) for at in poses]
+    for number in lit:
+        parts[number] = sunny(parts[number])
+    keyframes = keyframes_of(parts, poses, [3, 5, 7])
+    numbers = {(0,): [0, 1, 1], (1,): [0, 1, 0], (): [0, 0, 0]}[lit]
+    assert keyframes.drives.tolist() == np.repeat(numbers, len(poses[0])).tolist()
+    assert keyframes.first.all() and keyframes.trained == max(numbers) + 1
+    if not lit:
+        images = HOME.panoramas(unseen(), CONFIG)
+        off, turned, _ = errors(keyframes, images, unseen())
+        worse, *_ = errors(keyframes_of(parts[:1], poses[:1], [0]), images, unseen())
+        assert off.mean() < min(worse.mean(), 0.1) and np.degrees(turned.mean()) < 1.0
 
 
-def test_drives_that_do_not_meet_are_kept_apart():
+def test_drives_that_do_not_meet_keep_their_numbers():
     poses = [drive(0.5), drive(0.5) + np.array([50.0, 0.0, 0.0])]
     parts = [Spheres.about(n).panoramas(drive(0.5), CONFIG) for n in (0, 1)]
-    keyframes = fitted(parts, poses, [0, 1])
+    keyframes = keyframes_of(parts, poses, [0, 1])
     assert set(keyframes.drives.tolist()) == {0, 1} and keyframes.first.all()
     off, turned, _ = errors(keyframes, HOME.panoramas(unseen(), CONFIG), unseen())
     assert off.mean() < 0.1 and np.degrees(turned.mean()) < 1.0
 
 
-def test_each_drive_of_the_training_shows_the_place_in_its_own_light():
-    """Images in the light of one drive lie where that drive alone puts them, or better."""
-    world, poses, images = Spheres.about(1), [drive(0.57), drive(0.57) + 0.05], unseen()
-    plain = [world.panoramas(at, CONFIG) for at in (*poses, images)]
-    lit = [sunny(one) for one in plain]
-    both = fitted([plain[0], lit[1]], poses, [0, 1])
-    single = fitted([plain[0]], poses[:1], [0]), fitted([lit[1]], poses[1:], [0])
-    for seen, own, other in ((plain[2], *single), (lit[2], *single[::-1])):
-        joint, best, worst = (errors(k, seen, images)[0].mean() for k in (both, own, other))
-        assert joint < 1.25 * best and joint < worst / 2
+def test_each_drive_of_the_training_shows_the_place_in_its_light():
+    """Images in the light of a drive lie where that drive alone puts them, or better."""
+    world, poses = Spheres.about(1), [drive(0.57), drive(0.57) + 0.05]
+    plain = [world.panoramas(at, CONFIG) for at in (*poses, unseen())]
+    both = keyframes_of([plain[0], sunny(plain[1])], poses, [0, 1])
+    alike = keyframes_of(plain[:1], poses[:1], [0])
+    unlike = keyframes_of([sunny(plain[1])], poses[1:], [0])
+    for images, best, worst in ((plain[2], alike, unlike), (sunny(plain[2]), unlike, alike)):
+        of_both, of_best, of_worst = (
+            errors(keyframes, images, unseen())[0].mean() for keyframes in (both, best, worst)
+        )
+        assert of_both < 1.25 * of_best and of_both < of_worst / 2
 
 
 @pytest.mark.parametrize(('often', 'everywhere', 'number'), [(0, 4000, 2000), (9000, 16000, 3200)])
@@ -249,17 +246,17 @@ def test_color_weighs_about_as_much_as_brightness_and_a_gray_camera_has_none():
     gray = np.repeat(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)[:, :, None], 3, axis=2)
     assert all(np.ptp(part) < 1e-6 for part in np.split(texture(gray), rows)[1:])
     tinted = (image * np.array([0.8, 1.0, 0.9])).astype(np.uint8)
-    assert float((texture(image) * texture(tinted)).sum()) > 0.97, 'the white balance is no matter'
+    assert float((texture(image) * texture(tinted)).sum()) > 0.97, 'whatever the white balance'
 
 
 def test_images_beyond_the_keyframes_say_how_uncertain_their_place_is_and_those_among_do_not():
     rng = np.random.default_rng(1)
     columns = rng.uniform(2.0, 3.0, 60), rng.uniform(-1.5, 1.5, 60), rng.uniform(-3.0, 3.0, 60)
     (_, _, outside), (_, _, among) = errors_at(np.column_stack(columns)), errors_at(unseen())
-    assert all(map(known, outside)) and within(outside, np.column_stack(columns)) > 0.85
+    assert all(map(familiar, outside)) and within(outside, np.column_stack(columns)) > 0.85
     assert np.quantile(stds(among), 0.9) < 0.02 < np.median(stds(outside))
 
 
-def test_one_loose_stretch_does_not_make_all_headings_uncertain():
+def test_a_loose_stretch_does_not_make_all_headings_uncertain():
     stds = np.array([0.01] * 9 + [0.5])
     assert usual_turn_std(np.diag(stds**2)) == pytest.approx(0.01)

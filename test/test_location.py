@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """One mixture of hypotheses by keyframes, and of how wrong slow features may be."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sfa_localization.keyframes.errors import ErrorModel
-from sfa_localization.keyframes.location import SCALES, Hypothesis, Location, SlowPlace, located
+from sfa_localization.keyframes.location import SCALES, Location, located
 from sfa_localization.keyframes.regression import Fit
 
 STD = 0.1
@@ -24,12 +26,12 @@ def fit_at(x=0.0, y=0.0, yaw=0.0, unlike=0.1, outward=0.0, residual=None) -> Fit
 def locate(fits, slow=((0.0, 0.0),), std=1e3, scales=RIGHT, starts=None) -> Location:
     """By fits, each of its own start or of those given, and places (1 or N, 2) of slow features."""
     starts = range(len(fits)) if starts is None else starts
-    likely = [Hypothesis(fit, start) for fit, start in zip(fits, starts, strict=True)]
-    places = [SlowPlace(place, std**2) for place in np.broadcast_to(slow, (len(fits), 2))]
-    return located(likely, places, scales, ERRORS, np.zeros(2))
+    fits = [replace(fit, start=start) for fit, start in zip(fits, starts, strict=True)]
+    places = np.broadcast_to(slow, (len(fits), 2)), np.full(len(fits), std**2)
+    return located(fits, places, scales, ERRORS, np.zeros(2))
 
 
-def test_one_hypothesis_and_right_slow_features_are_fused_by_their_information():
+def test_a_hypothesis_and_slow_features_are_fused_by_their_information():
     """By hand: variances of 0.01 and 0.03 m^2 at 0 and 1 m give 0.0075 m^2 at 0.25 m."""
     location = locate([fit_at(yaw=3.0)], [(1.0, 0.0)], np.sqrt(0.03))
     assert location.pose == pytest.approx([0.25, 0.0, 3.0])
@@ -61,13 +63,13 @@ def test_what_explains_more_of_an_image_or_agrees_with_slow_features_is_believed
     assert np.trace(location.covariance[:2, :2]) < 2.5 * STD**2
 
 
-def test_lights_of_the_training_that_put_an_image_apart_make_its_place_uncertain():
-    """Along the axis on which they differ, and not where one of them explains far less."""
+def test_lights_of_the_training_that_disagree_make_a_place_uncertain():
+    """Along the axis on which they differ, and not where the other light explains far less."""
     alike, mostly = (
         locate([fit_at(-0.2), fit_at(0.2, unlike=unlike)], starts=(0, 0)) for unlike in (0.1, 0.5)
     )
     assert alike.pose == pytest.approx(np.zeros(3), abs=1e-6)
-    variances = [np.diag(one.covariance)[:2] / STD**2 for one in (alike, mostly)]
+    variances = [np.diag(each.covariance)[:2] / STD**2 for each in (alike, mostly)]
     np.testing.assert_allclose(variances, [[5.0, 1.0], [1.0, 1.0]], rtol=1e-3)
     assert mostly.pose[0] == pytest.approx(-0.2, abs=1e-3)
 

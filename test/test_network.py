@@ -11,17 +11,9 @@ from cylinder_worlds import ARCHITECTURE, SIZE
 from test_rotation import views
 
 from sfa_localization.data.errors import ConfigError, ModelError
+from sfa_localization.sfa import network as sfa
 from sfa_localization.sfa.image_features import slow_features
-from sfa_localization.sfa.network import (
-    NORMALIZATIONS,
-    Architecture,
-    Layer,
-    Network,
-    Node,
-    input_map,
-    resampled,
-)
-from sfa_localization.sfa.network import STANDARD_NETWORKS as STANDARD
+from sfa_localization.sfa.network import Architecture, Layer, Network, Node, input_map, resampled
 
 
 def random_network(architecture: Architecture, seed: int = 0) -> Network:
@@ -62,16 +54,16 @@ def scene(rows: int, columns: int) -> np.ndarray:
 
 @SIZES
 def test_maps_have_the_standard_shapes_and_turn_with_the_robot(size, grid, rotations, rows):
-    layers = STANDARD[grid]
-    for normalization in NORMALIZATIONS:
+    layers = sfa.STANDARD_NETWORKS[grid]
+    for normalization in sfa.NORMALIZATIONS:
         architecture = Architecture(size, grid, normalization, layers)
         assert (architecture.rotations, architecture.map_rows) == (rotations, rows)
         network, images = random_network(architecture), pictures(size, 2)
         step = size[1] * layers[0].stride[1] // grid[1]
         both = [network.maps(part) for part in (images, np.roll(images, 7 * step, axis=2))]
-        for one, other, layer, row in zip(*both, layers, rows[1:], strict=True):
-            assert one.shape == (2, row, rotations, layer.outputs)
-            assert np.allclose(np.roll(one, 7, axis=2), other, atol=1e-5)
+        for plain, turned, layer, row in zip(*both, layers, rows[1:], strict=True):
+            assert plain.shape == (2, row, rotations, layer.outputs)
+            assert np.allclose(np.roll(plain, 7, axis=2), turned, atol=1e-5)
         assert np.allclose(*map(slow_features, both), atol=1e-5)
 
 
@@ -97,7 +89,7 @@ def prepared(images, normalization, grid=SIZE):
     return input_map(images, Architecture(SIZE, grid, normalization, (layer,)))
 
 
-def test_too_many_pixels_are_averaged_and_grey_has_one_channel():
+def test_too_many_pixels_are_averaged_and_grey_has_a_single_channel():
     images = pictures(SIZE, 1)
     smaller = prepared(images, 'none', (6, 24)).reshape(6, 24, 3)
     mean = images[0].reshape(6, 2, 24, 2, 3).mean((1, 3))
@@ -111,13 +103,13 @@ def test_too_many_pixels_are_averaged_and_grey_has_one_channel():
 @pytest.mark.parametrize('size', [(15, 90), (25, 120), (29, 299), (150, 720), (600, 120)])
 def test_a_scene_looks_alike_in_all_sizes_and_its_ends_belong_together(size):
     grid, image = (30, 300), scene(*size)
-    shown = resampled(image, grid)
-    assert shown.shape == (*grid, 3)
-    assert np.abs(shown.astype(float) - scene(*grid)).max() < 12
+    smaller = resampled(image, grid)
+    assert smaller.shape == (*grid, 3)
+    assert np.abs(smaller.astype(float) - scene(*grid)).max() < 12
     turned = resampled(np.roll(image, size[1] // 2, axis=1), grid)
     shift = 300 * (size[1] // 2) / size[1]
     frequencies = np.fft.rfftfreq(300)[:, None] * shift
-    back = np.fft.rfft(shown.astype(float), axis=1) * np.exp(-2j * np.pi * frequencies)
+    back = np.fft.rfft(smaller.astype(float), axis=1) * np.exp(-2j * np.pi * frequencies)
     assert np.abs(np.fft.irfft(back, 300, axis=1) - turned).max() < 6
 
 
@@ -141,4 +133,4 @@ def test_another_size_and_odd_grids_are_refused():
         ((30, 50), 'wider than the 10 columns'),
     ):  # fmt: skip
         with pytest.raises(ConfigError, match=reason):
-            Architecture((60, 600), grid, 'panorama', STANDARD[30, 300])
+            Architecture((60, 600), grid, 'panorama', sfa.STANDARD_NETWORKS[30, 300])

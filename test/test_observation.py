@@ -19,16 +19,16 @@ from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.keyframes.errors import ErrorModel
 from sfa_localization.keyframes.light import Conditions
-from sfa_localization.keyframes.location import SCALES, Hypothesis, SlowPlace, located
+from sfa_localization.keyframes.location import located
 from sfa_localization.localizer import Localizer, Observer, unusable_covariance
 from sfa_localization.place_model import PlaceModel
 
 
 def test_a_repeated_picture_is_a_frozen_camera_until_it_changes():
     watch = ImageWatch()
-    found = [watch.judge(panorama(seed=seed)) for seed in (1, 1, 1, 1, 1, 1, 2, 2, 1)]
-    assert ['repeats' in text for text in found] == [False] + [True] * 5 + [False, True, False]
-    assert ['frozen' in text for text in found] == [False] * 4 + [True] * 2 + [False] * 3
+    problems = [watch.judge(panorama(seed=seed)) for seed in (1, 1, 1, 1, 1, 1, 2, 2, 1)]
+    assert ['repeats' in text for text in problems] == [False] + [True] * 5 + [False, True, False]
+    assert ['frozen' in text for text in problems] == [False] * 4 + [True] * 2 + [False] * 3
 
 
 def test_a_believed_picture_gives_the_models_pose_and_covariance():
@@ -40,7 +40,7 @@ def test_a_believed_picture_gives_the_models_pose_and_covariance():
     assert seen.pose.tolist() == [3.0, 4.0, 0.0] and math.isnan(seen.yaw), 'as on the topic'
 
 
-def test_an_estimate_that_is_not_finite_says_that_nothing_is_known_and_the_filter_leaves_it_out():
+def test_an_estimate_that_is_not_finite_is_left_out_by_the_filter():
     reader = PictureReader()
     reader.locate = lambda image: replace(PictureReader().locate(image), pose=np.full(3, np.nan))
     seen = Observer(reader).observe(7, panorama())
@@ -63,7 +63,7 @@ def mixed_run(count=3 * BATCH + 5):
     return Run('mixed', PanoramaArray(stamps, np.array(pictures)), still)
 
 
-def test_in_batches_and_one_by_one_images_are_judged_alike():
+def test_images_are_judged_alike_in_batches_and_singly():
     run = mixed_run()
     batched = list(Observer(PictureReader()).observe_run(run))
     single = Observer(PictureReader())
@@ -75,13 +75,13 @@ def test_in_batches_and_one_by_one_images_are_judged_alike():
         assert (alone.stamp_ns, alone.problem) == (seen.stamp_ns, seen.problem)
         assert np.array_equal(alone.pose, seen.pose)
         assert np.array_equal(alone.covariance, seen.covariance)
-    found = [seen.problem for seen in batched if seen.problem]
-    assert len(found) == 1 + 3 + 5 + 1 + 1
+    problems = [seen.problem for seen in batched if seen.problem]
+    assert len(problems) == 1 + 3 + 5 + 1 + 1
     kinds = ('dark', 'covered', 'repeats the one', 'frozen', 'unlike')
-    assert {next(kind for kind in kinds if kind in text) for text in found} == set(kinds)
+    assert {next(kind for kind in kinds if kind in text) for text in problems} == set(kinds)
 
 
-def test_what_is_no_panorama_or_has_another_size_is_one_error():
+def test_other_objects_and_sizes_are_the_same_error():
     localizer = Localizer(PictureReader())
     for image in (
         None, 'image', b'bytes', [[1, 2, 3]], np.zeros((4, 8)), np.zeros((4, 8, 4), np.uint8),
@@ -105,58 +105,18 @@ def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp(
     assert [event[1] for event in merge_by_stamp(odometry, pictures[:0])] == [ODOMETRY] * 3
 
 
-# One image, by what keyframes and slow features say of it; test_location.py has the rest.
+# Many images, one after the other; test_location.py has the single ones.
 
 EXACT = ErrorModel(floor_m=0.0, residual=1.0, outward_m=0.0, slow=1.0, slow_m=0.0, yaw_std=0.1)
 """Both err by what they claim."""
-AS_TRAINED = np.where(SCALES == 1.0, 1.0, 1e-12)
-NOWHERE = SlowPlace(np.zeros(2), 1e9)
-
-
-def begun(std_m=0.1, unlike=0.25, outward=0.2):
-    """Keyframes put an image at the origin."""
-    fit = fit_at([0.0, 0.0], 1 / (1 + unlike), variance=std_m**2, outward=outward)
-    return Hypothesis(fit, 0)
-
-
-def slow_at(x, std_m=0.1):
-    """Slow features put it on the x axis."""
-    return SlowPlace(np.array([x, 0.0]), std_m**2)
-
-
-def put(likely, slow, scales=AS_TRAINED, errors=EXACT):
-    """Where an image is, by hypotheses and what slow features say at the heading of each."""
-    return located(likely, slow, scales, errors, np.zeros(2))
-
-
-def stds(location):
-    """Standard deviations along each axis, m, and of the heading, rad."""
-    return np.sqrt(np.diag(location.covariance))
-
-
-def test_beside_the_keyframes_both_extrapolate_and_the_less_sure_they_are():
-    """An image of which half is unexplained, in the middle, at the border and far beside."""
-    errors = ErrorModel(floor_m=0.02, residual=1.0, outward_m=0.8, slow=1.0, slow_m=0.3)
-    by_keyframes, by_both = (
-        [stds(put([begun(0.01, unlike=1.0, outward=o)], [slow], errors=errors))[0]
-         for o in (0.0, 0.64, 1.0)]
-        for slow in (NOWHERE, slow_at(0.0))
-    )  # fmt: skip
-    own = np.array([np.hypot(np.hypot(0.02, 0.01), 0.8 * o * np.log(2)) for o in (0, 0.64, 1)])
-    other = np.hypot(0.1, 0.3 * np.log(2))
-    assert by_keyframes == pytest.approx(own, rel=1e-4)
-    assert by_both == pytest.approx((own**-2 + other**-2) ** -0.5, rel=1e-4)
-
-
-# And of many, one after the other.
 
 
 class Matched(PictureReader):
-    """A model whose slow features and keyframes are given."""
+    """A model whose keyframes put images at the origin, and whose slow features at x (m)."""
 
-    def __init__(self, likely, slow, errors=EXACT, center=(0.0, 0.0)):
+    def __init__(self, x=0.0, unlike=0.25, errors=EXACT, center=(0.0, 0.0)):
         super().__init__()
-        self.likely, self.slow = likely, slow
+        self.x, self.unlike = x, unlike
         self.rig = Rig(wheel_scale=Quantity(1.0, 0.01))
         self.keyframes = SimpleNamespace(errors=errors, poses=np.array([[*center, 0.0]]))
 
@@ -164,7 +124,9 @@ class Matched(PictureReader):
         return [SimpleNamespace(slow_features=np.zeros(2))] * len(images)
 
     def located(self, view, conditions):
-        return put(self.likely, self.slow, conditions.scales, self.keyframes.errors)
+        fit = fit_at([0.0, 0.0], 1 / (1 + self.unlike), variance=0.1**2, outward=0.2)
+        slow = np.array([[self.x, 0.0]]), np.array([0.1**2])
+        return located([fit], slow, conditions.scales, self.keyframes.errors, np.zeros(2))
 
     observed = PlaceModel.observed
 
@@ -180,49 +142,36 @@ def last_of(count, observer):
 
 
 def test_the_errors_of_the_map_and_of_its_scale_about_its_center_are_in_the_covariance():
-    both = [begun()], [slow_at(0.0)]
     others = {'center': (10.0, 0.0)}, {'errors': replace(EXACT, map_m=0.2, turn_std=0.03)}
     plain, aside, wrong = (
-        last_of(1, Observer(Matched(*both, **more))).covariance for more in ({}, *others)
+        last_of(1, Observer(Matched(**more))).covariance for more in ({}, *others)
     )
     assert np.allclose(aside - plain, np.diag([0.1**2, 0.0, 0.0]))
     assert np.allclose(wrong - plain, np.diag([0.2, 0.2, 0.03]) ** 2)
 
 
-def test_slow_features_that_are_wrong_of_late_lose_their_weight_and_get_it_back():
+def test_slow_features_that_err_lose_their_weight_and_get_it_back():
     """In another light, which the model of another day may know."""
-    right, wrong = [slow_at(0.1)], [slow_at(3.0)]
-    observer = Observer(model := Matched([begun()], right))
+    observer = Observer(model := Matched(0.1))
     assert last_of(30, observer).position[0] == pytest.approx(0.05, abs=0.01)
     assert observer.slow_error_factor < 1.5
-    model.slow = wrong
+    model.x = 3.0
     assert abs(last_of(30, observer).position[0]) < 0.02
     assert 10 < observer.slow_error_factor < 50
-    model.slow = right
+    model.x = 0.1
     assert last_of(50, observer).position[0] == pytest.approx(0.05, abs=0.01)
     observer.use(model)
     assert observer.slow_error_factor == Conditions().slow_error_factor
 
 
-def test_slow_features_are_not_blamed_for_errors_of_uncertain_keyframes():
-    """Beside all keyframes these err by more than slow features, as they say."""
-    observer = Observer(model := Matched([begun()], [slow_at(0.0)]))
-    last_of(30, observer)
-    model.likely, model.slow = [begun(0.6)], [slow_at(1.0)]
-    assert last_of(30, observer).position[0] == pytest.approx(36 / 37, abs=0.05)
-
-
 @pytest.mark.parametrize('kind', ['unlike', 'dark', 'repeats'])
 def test_images_that_are_not_used_teach_nothing(kind):
     """What is nowhere seems to be anywhere, and slow features as wrong."""
-    likely = [begun(unlike=9.0 if kind == 'unlike' else 0.25)]
-    observer = Observer(Matched(likely, [slow_at(3.0)]))
+    observer = Observer(Matched(3.0, unlike=9.0 if kind == 'unlike' else 0.25))
     picture = panorama()
     if kind == 'repeats':
         observer.watch.judge(picture)
     for k in range(1, 30):
-        seen = observer.observe(
-            k, {'unlike': panorama(seed=k), 'dark': 0 * picture}.get(kind, picture)
-        )
-        assert seen.problem
+        image = {'unlike': panorama(seed=k), 'dark': 0 * picture}.get(kind, picture)
+        assert observer.observe(k, image).problem
     assert observer.slow_error_factor == Conditions().slow_error_factor

@@ -41,13 +41,13 @@ def test_the_ridge_is_that_of_standardized_monomials():
     weights = np.linalg.solve(terms.T @ terms + np.diag(basis.ridge), terms.T @ target)
     plain = monomials(FEATURES[:, :2])[:, 1:]
     plain = (plain - plain.mean(0)) / plain.std(0)
-    own = np.linalg.solve(
+    direct = np.linalg.solve(
         plain.T @ plain + ridge * 80 * np.eye(5), plain.T @ (target - target.mean())
     )
-    assert np.allclose(terms @ weights, plain @ own + target.mean(), atol=1e-10)
+    assert np.allclose(terms @ weights, plain @ direct + target.mean(), atol=1e-10)
 
 
-def test_the_kernel_is_positive_and_one_at_home():
+def test_the_kernel_is_positive_and_normalized():
     kernel = matern(FEATURES, FEATURES)
     assert np.allclose(np.diag(kernel), 1.0, atol=1e-7)
     assert np.linalg.eigvalsh(kernel)[0] > 0
@@ -105,10 +105,10 @@ def metric_map(basis):
 
 def test_the_map_is_the_regression_in_closed_form(basis, metric_map):
     terms, (mean, root) = expand(basis, FEATURES), regressed(basis)
-    own = NOISE_M**2 * (((terms @ root) ** 2).sum(1) + 1.0 + missing(basis, terms))
+    variance = NOISE_M**2 * (((terms @ root) ** 2).sum(1) + 1.0 + missing(basis, terms))
     positions, covariances = metric_map.predict(FEATURES)
     assert np.allclose(positions, terms @ mean, atol=1e-6)
-    expected = (2.0 * own + 0.1**2)[:, None, None] * np.eye(2)
+    expected = (2.0 * variance + 0.1**2)[:, None, None] * np.eye(2)
     assert np.allclose(covariances, expected, rtol=0.01)
     assert np.array_equal(covariances, covariances.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(covariances).min() >= 2.0 * NOISE_M**2 * (1 - 1e-9)

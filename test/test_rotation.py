@@ -7,12 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfa_localization.sfa.rotation import (
-    Field,
-    FieldStatistics,
-    SampleStatistics,
-    unfold,
-)
+from sfa_localization.sfa.rotation import Field, FieldStatistics, SampleStatistics, unfold
 from sfa_localization.sfa.slowness import Statistics
 
 FIELDS = (
@@ -77,21 +72,20 @@ def assert_equal(ours: Statistics, theirs: Statistics, tolerance: float = 1e-5) 
         assert np.abs(a - b).max() < tolerance * np.abs(b).max(), name
 
 
-def field_statistics(of, field, joined, batch=1000):
-    sums = FieldStatistics(field, of.shape[2], field.rows * of.shape[3])
-    return fed(sums, of, joined, batch)
+def field_statistics(of, field, joined):
+    return fed(FieldStatistics(field, of.shape[2], field.rows * of.shape[3]), of, joined)
 
 
-def sample_statistics(of, joined, batch=1000):
+def sample_statistics(of, joined):
     signals = of.transpose(3, 0, 1, 2).copy()
-    return fed(SampleStatistics(of.shape[2], of.shape[-1]), signals, joined, batch, axis=1)
+    return fed(SampleStatistics(of.shape[2], of.shape[-1]), signals, joined, axis=1)
 
 
-def fed(sums, of, joined, batch, axis=0):
+def fed(sums, of, joined, batch=1000, axis=0):
     joined = np.concatenate([[True], joined])
     cuts = range(batch, of.shape[axis], batch)
-    for maps, part in zip(np.split(of, cuts, axis), np.split(joined, cuts), strict=True):
-        sums.add(maps, part.astype(bool))
+    for part, pairs in zip(np.split(of, cuts, axis), np.split(joined, cuts), strict=True):
+        sums.add(part, pairs.astype(bool))
     return sums.result()
 
 
@@ -105,55 +99,41 @@ def test_statistics_equal_brute_force(joined):
         assert np.array_equal(unfold(of, field), views(of, field).astype(np.float32))
     explicit = brute_force(turned.astype(np.float64), 12, joined)
     assert_equal(sample_statistics(of, joined), explicit)
-    one, none = of[:1], np.zeros(0, bool)  # a single picture turns, but does not move
-    explicit = brute_force(views(sequence(one), FIELDS[0]), 12, none)
-    assert_equal(field_statistics(one, FIELDS[0], none), explicit)
-    assert_equal(sample_statistics(one, none), brute_force(sequence(one), 12, none))
-
-
-def without_rotation(signals: np.ndarray, joined: np.ndarray) -> tuple[float, np.ndarray]:
-    """Steps and differences between images (T, rows, R, D) at the same view, divided by R."""
-    rotations, d = signals.shape[2], signals.shape[-1]
-    difference = np.diff(signals, axis=0)[joined].reshape(-1, d)
-    return len(difference) / rotations, difference.T @ difference / rotations
+    single, none = of[:1], np.zeros(0, bool)  # it turns, but does not move
+    explicit = brute_force(views(sequence(single), FIELDS[0]), 12, none)
+    assert_equal(field_statistics(single, FIELDS[0], none), explicit)
+    assert_equal(sample_statistics(single, none), brute_force(sequence(single), 12, none))
 
 
 @pytest.mark.parametrize('joined', [JOINED, BROKEN])
 def test_without_rotation_only_images_at_the_same_view_are_compared(joined):
     of, field = maps(1, 6), FIELDS[1]
-    seen = views(of, field)
     plain = fed(FieldStatistics(field, 12, 6, rotate=False), of, joined, batch=4)
     signals = of.transpose(3, 0, 1, 2).copy()
     samples = fed(SampleStatistics(12, 3, rotate=False), signals, joined, batch=4, axis=1)
-    for ours, explicit in ((plain, seen), (samples, of.astype(np.float64))):
-        steps, difference = without_rotation(explicit, joined)
-        assert ours.steps == pytest.approx(steps)
-        assert np.abs(ours.difference - difference).max() < 1e-5 * np.abs(difference).max()
+    for ours, explicit in ((plain, views(of, field)), (samples, of.astype(np.float64))):
         flat = explicit.reshape(-1, explicit.shape[-1])
-        assert np.allclose(ours.second, flat.T @ flat, rtol=1e-5)
+        steps = np.diff(explicit, axis=0)[joined].reshape(-1, explicit.shape[-1])
+        differences = len(steps) / 12, steps.T @ steps / 12
+        expected = Statistics(len(flat), flat.sum(0), flat.T @ flat, *differences)
+        assert_equal(ours, expected)
 
 
 @given(batch=st.integers(1, 9), broken=st.integers(0, 7), seed=st.integers(0, 50))
 @settings(max_examples=25, deadline=None)
-def test_batches_equal_the_whole(batch, broken, seed):
-    of, field = maps(seed, 9), Field(2, 3, 1, spacing=2)
-    joined = np.arange(8) != broken
-    assert_equal(field_statistics(of, field, joined, batch), field_statistics(of, field, joined))
-    assert_equal(sample_statistics(of, joined, batch), sample_statistics(of, joined))
-
-
-def test_merging_with_a_lead_equals_the_whole():
-    of, field, joined = maps(4, 9), FIELDS[1], np.arange(8) % 3 != 1
+def test_batches_and_merged_parts_equal_the_whole(batch, broken, seed):
+    of, field, joined = maps(seed, 9), FIELDS[1], np.arange(8) != broken
     signals = of.transpose(3, 0, 1, 2).copy()
-    for whole, make, part in (
-        (field_statistics(of, field, joined), lambda: FieldStatistics(field, 12, 6),
-         lambda *cut: of[slice(*cut)]),
-        (sample_statistics(of, joined), lambda: SampleStatistics(12, 3),
-         lambda *cut: signals[:, slice(*cut)].copy()),
-    ):  # fmt: skip
-        first, second = make(), make()
-        first.add(part(0, 5), np.concatenate([[False], joined[:4]]))
-        second.lead(part(4, 5))
-        second.add(part(5, 9), joined[4:])
+    for sums_of, feed, axis in (
+        (lambda: FieldStatistics(field, 12, 6), of, 0),
+        (lambda: SampleStatistics(12, 3), signals, 1),
+    ):
+        whole = fed(sums_of(), feed, joined, 1000, axis)
+        assert_equal(fed(sums_of(), feed, joined, batch, axis), whole)
+        first, second = sums_of(), sums_of()
+        begin, lead, end = np.split(feed, (4, 5), axis)
+        first.add(np.concatenate([begin, lead], axis), np.concatenate([[False], joined[:4]]))
+        second.lead(lead)
+        second.add(end, joined[4:])
         first.merge(second)
         assert_equal(first.result(), whole)

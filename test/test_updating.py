@@ -168,7 +168,7 @@ def finer(odometry, times=10):
 def added(model, count, x_m, name='later'):
     """The model with so many more keyframes in a row that begins at x."""
     poses = np.column_stack([x_m + 0.01 * np.arange(count), np.zeros((count, 2))])
-    texture = np.fft.irfft(model.keyframes.spectra([0]), model.keyframes.columns)
+    texture = np.fft.irfft(model.keyframes.spectrum(0)[None], model.keyframes.columns)
     textures = np.repeat(updating.quantized(texture), count, 0)
     return extended(model, Additions(textures, poses), name)
 

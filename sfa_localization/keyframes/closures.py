@@ -18,8 +18,15 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.run import Odometry, Run, Stamps
 from sfa_localization.data.statistics import evenly
-from sfa_localization.keyframes.correlation import Scores, coarse, coarse_scores, correlate
-from sfa_localization.keyframes.texture import quantized, spectra_of, texture
+from sfa_localization.keyframes.texture import (
+    Scores,
+    coarse,
+    coarse_scores,
+    correlate,
+    quantized,
+    spectra_of,
+    texture,
+)
 
 LIKE = 0.55
 """Least correlation of a closure: images of other places reach 0.4, some a little more."""

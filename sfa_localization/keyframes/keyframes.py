@@ -16,13 +16,16 @@ from numpy.typing import NDArray
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.keyframes.correlation import COARSE, Scores, coarse, correlate
 from sfa_localization.keyframes.errors import ErrorModel
 from sfa_localization.keyframes.regression import Fit, regress
 from sfa_localization.keyframes.texture import (
+    COARSE,
+    Scores,
     Spectra,
     channels,
+    coarse,
     columns_of,
+    correlate,
     spectra_of,
     spectrum,
     turned,
@@ -61,18 +64,13 @@ class Keyframes:
 
     @classmethod
     def of(
-        cls,
-        textures: NDArray[np.int8],
-        poses: Array,
-        sphere: Sphere,
-        drives: NDArray[np.int32] | None = None,
+        cls, textures: NDArray[np.int8], poses: Array, sphere: Sphere, drives: NDArray[np.int32]
     ) -> Keyframes:
-        """Keyframes of quantized textures (K, rows, columns), by default of one drive, all of the
-        training. Raises DataError for too few.
+        """Keyframes of the training by quantized textures (K, rows, columns). Raises DataError for
+        too few.
         """
         if len(poses) < FEWEST:
             raise DataError(f'{len(poses)} images are too few for keyframes')
-        drives = np.zeros(len(poses), np.int32) if drives is None else drives
         values, step = encoded(textures, poses, sphere)
         trained = int(drives.max()) + 1
         return cls(values, step, textures.shape[2], poses, ErrorModel(), sphere, drives, trained)
@@ -82,12 +80,12 @@ class Keyframes:
         parts = self.values[rows], self.poses[rows], self.drives[rows]
         return dataclasses.replace(self, values=parts[0], poses=parts[1], drives=parts[2])
 
-    def spectra(self, rows: Any = slice(None)) -> Spectra:
-        """The spectra (M, rows, F) of the textures of some keyframes, by default of all."""
-        return turned(self.aligned(rows), -self.sign * self.poses[rows, 2])
+    def spectrum(self, row: int) -> Spectra:
+        """The spectrum (rows, F) of the texture of a keyframe."""
+        return turned(self.aligned([row])[0], -self.sign * self.poses[row, 2])
 
     def aligned(self, rows: Any) -> Spectra:
-        """The same spectra, turned to yaw 0."""
+        """The spectra (M, rows, F) of some keyframes, turned to yaw 0."""
         parts = self.values[rows].astype(np.float32) * np.float32(self.step)
         return np.asarray(parts.view(np.complex64).swapaxes(1, 2))
 
@@ -158,10 +156,8 @@ class Keyframes:
         places, drives = self.poses[rows, :2], self.drives[rows]
         fit = regress(changes, self.aligned(rows), places, drives, self.channels, self.columns)
         facing, turn = complex(fit.shares @ np.exp(1j * self.poses[rows, 2])), float(fit.changes[2])
-        residual = turned(fit.residual, -turn)
-        return dataclasses.replace(
-            fit, yaw=yaw - self.sign * turn, facing=facing, residual=residual
-        )
+        yaw, residual = yaw - self.sign * turn, turned(fit.residual, -turn)
+        return dataclasses.replace(fit, yaw=yaw, facing=facing, residual=residual)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to save, without pickle."""

@@ -5,7 +5,7 @@
 Each keyframe about as like the image as the likest one starts a hypothesis h, if no other one
 starts near it at about the same heading: a regression among its neighbors puts the image at p_h
 with variance v_h (`ErrorModel`), and leaves the part u_h of it unexplained. An image counts as n
-independent numbers:
+independent numbers (`PARTS`):
 
     -2 ln p(image | h) = n ln(u_h / (1 + u_h)).
 
@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,33 +40,8 @@ STARTS, SPACING_M, SPACING_RAD = 3, 1.0, 0.5
 regression tells nearer places apart."""
 LESS_LIKE = 0.1
 """The correlation with such a keyframe is at most so much less than that with the likest one."""
-PARTS = 60
-"""n: neighboring pixels are one. From 20 to 200, places are the same."""
 SCALES = 3.0 ** np.arange(8)
 """Of the variance of slow features, up to standard deviations that are 47 times as large."""
-
-
-@dataclass(frozen=True, slots=True)
-class Hypothesis:
-    """A `fit` from one of several starts, numbered `start`."""
-
-    fit: Fit
-    start: int
-
-    @property
-    def evidence(self) -> float:
-        """ln p(image | h), up to a constant."""
-        return PARTS / 2 * math.log1p(1 / max(self.fit.unlike, 1e-9))
-
-
-@dataclass(frozen=True, slots=True)
-class SlowPlace:
-    """Where slow features put an image: `place` (2,) m, and the `variance` m^2 along each axis that
-    their map claims.
-    """
-
-    place: Array
-    variance: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +60,8 @@ class Location:
 
 
 def hypotheses(
-    keyframes: Keyframes, image: UprightImage, pattern: Spectra | None = None
-) -> tuple[list[Hypothesis], Array]:
+    keyframes: Keyframes, image: UprightImage, pattern: Spectra | None
+) -> tuple[list[Fit], Array]:
     """Where an image may have been taken, without the `pattern` (rows, F) of its light and without
     the tilt that the likeliest hypothesis finds; and its whole tilt, (2,) rad.
     """
@@ -97,37 +72,37 @@ def hypotheses(
     return likely, upright.tilt + _remaining_tilt(likely)
 
 
-def _remaining_tilt(likely: Sequence[Hypothesis]) -> Array:
+def _remaining_tilt(fits: Sequence[Fit]) -> Array:
     """Roll and pitch (2,) rad that an image shows by the likeliest hypothesis."""
-    return max(likely, key=lambda hypothesis: hypothesis.evidence).fit.changes[:2]
+    return max(fits, key=lambda fit: fit.evidence).changes[:2]
 
 
 def located(
-    likely: Sequence[Hypothesis],
-    slow: Sequence[SlowPlace],
+    fits: Sequence[Fit],
+    slow: tuple[Array, Array],
     scales: Array,
     errors: ErrorModel,
     tilt: Array,
 ) -> Location:
-    """The mixture of hypotheses with what slow features say at the heading of each; `scales` (S,)
-    are the probabilities of `SCALES` by the images before, `tilt` (2,) that of the image.
+    """The mixture of H hypotheses with the places (H, 2) m of slow features at the heading of each,
+    and their variances (H,) m^2 along each axis by the map; `scales` (S,) are the probabilities of
+    `SCALES` by the images before, `tilt` (2,) that of the image.
     """
-    fits = [hypothesis.fit for hypothesis in likely]
-    numbers = [(f.variance, f.outward, f.unlike, f.yaw) for f in fits]
-    by_residual, outward, unlike, yaws = np.array(numbers).T
+    numbers = [(f.variance, f.outward, f.unlike, f.yaw, f.evidence, f.start) for f in fits]
+    by_residual, outward, unlike, yaws, evidence, starts = np.array(numbers).T
     places = np.array([f.place for f in fits])
     # (H, 1), and at all scales (H, S).
     by_keyframes = errors.variance(by_residual, outward, unlike)[:, None]
-    by_slow = errors.slow_variance(np.array([s.variance for s in slow]), unlike)[:, None]
+    by_slow = errors.slow_variance(slow[1], unlike)[:, None]
     total = by_keyframes + by_slow * SCALES
-    gain, difference = by_keyframes / total, np.array([s.place for s in slow]) - places
-    evidence = np.array([hypothesis.evidence for hypothesis in likely])[:, None] + np.log(scales)
-    evidence -= np.log(total) + (difference**2).sum(1)[:, None] / (2 * total)
-    weight = np.exp(evidence - evidence.max())
+    gain, difference = by_keyframes / total, slow[0] - places
+    joint = evidence[:, None] + np.log(scales) - np.log(total)
+    joint -= (difference**2).sum(1)[:, None] / (2 * total)
+    weight = np.exp(joint - joint.max())
     weight /= weight.sum()
     means = places[:, None] + gain[:, :, None] * difference[:, None]
-    starts, by_fit = np.array([h.start for h in likely]), weight.sum(axis=1)
-    here = starts == np.bincount(starts, by_fit).argmax()
+    by_fit = weight.sum(axis=1)
+    here = starts == np.bincount(starts.astype(int), by_fit).argmax()
     near = np.where(here[:, None], weight, 0.0) / by_fit[here].sum()
     place, of_fit = np.tensordot(near, means, 2), near.sum(axis=1)
     yaw = float(np.angle(of_fit @ np.exp(1j * yaws)))
@@ -141,18 +116,16 @@ def located(
     return Location(pose, covariance, fit, facing, weight.sum(axis=0), tilt)
 
 
-def _from_starts(
-    keyframes: Keyframes, image: UprightImage, pattern: Spectra | None
-) -> list[Hypothesis]:
+def _from_starts(keyframes: Keyframes, image: UprightImage, pattern: Spectra | None) -> list[Fit]:
     """Hypotheses of an image in each light of the training from each start."""
-    likely, lights = list[Hypothesis](), keyframes.likeliest_lights(image.scores)
+    likely, lights = list[Fit](), keyframes.likeliest_lights(image.scores)
     for start, (x, y, yaw) in enumerate(_starts(keyframes, image)):
         spectrum = image.spectrum
         if pattern is not None:
             spectrum = spectrum - turned(pattern, -keyframes.sign * yaw)
         for light in lights:
             fit = keyframes.fit_about(spectrum, np.array([x, y]), yaw, light)
-            likely.append(Hypothesis(fit, start))
+            likely.append(replace(fit, start=start))
     return likely
 
 

@@ -17,13 +17,11 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array, Indices, wrap_angle
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.keyframes.closures import Textures
-from sfa_localization.keyframes.keyframes import NEIGHBORS, Keyframes
+from sfa_localization.keyframes.keyframes import FEWEST, NEIGHBORS, Keyframes
 
 # Spacing of the views that are located, along a drive or in a turn, which shows where the camera
 # sits: the errors of nearer ones are alike.
 _SPACING_M, _SPACING_RAD = 0.5, 0.5
-# The least number of views among which another one is located.
-_FEWEST = 12
 # An image of which more than this part is unlike all around is of another place, or beside them.
 _UNLIKE = 0.5
 
@@ -57,7 +55,7 @@ def find_offsets(views: Textures, poses: Array, sphere: Sphere) -> Offsets:
     """Offsets of views by their rough poses (S, 3) in any frame; NaN for views without one."""
     placed = np.flatnonzero(np.isfinite(poses).all(axis=1))
     views, poses = views.take(placed), poses[placed]
-    if len(poses) < _FEWEST:
+    if len(poses) < FEWEST:
         return Offsets.none()
     drives = views.run.astype(np.int32)
     keyframes = Keyframes.of(views.textures, poses, sphere, drives)
@@ -66,9 +64,9 @@ def find_offsets(views: Textures, poses: Array, sphere: Sphere) -> Offsets:
         distance = np.hypot(*(poses[:, :2] - poses[row, :2]).T)
         near = np.argsort(distance, kind='stable')
         near = near[~views.near(row, near)][:NEIGHBORS]
-        if len(near) < _FEWEST:
+        if len(near) < FEWEST:
             continue
-        fit = keyframes.fit(keyframes.spectra([row])[0], poses[row, 2], near)
+        fit = keyframes.fit(keyframes.spectrum(row), poses[row, 2], near)
         if fit.unlike < _UNLIKE:
             shares, turn = np.zeros((2, NEIGHBORS))
             others = np.full(NEIGHBORS, near[0])

@@ -16,6 +16,7 @@ The products are weighted by channel, by how well the keyframes explain each.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -32,6 +33,9 @@ _LIKENESS = 0.05
 _RIDGE = 0.005
 BORDER = 0.6
 """Beyond this `Fit.outward` a place is at the border of the keyframes, or beside them."""
+PARTS = 60
+"""Independent numbers that an image counts as: neighboring pixels are one. From 20 to 200, places
+are the same."""
 _TINY = 1e-6
 # Parts of the panorama in which light, or what hides the view, is one error: 22.5 degrees.
 _SECTORS = 16
@@ -50,7 +54,7 @@ class Fit:
     of the place, along each axis, if sectors of the panorama err independently. `outward` is the
     distance of the place from the middle of the keyframes, over their mean distance from it: 0
     among them, 0.64 at a straight border of theirs, 1 far beside all. `facing` is the mean of
-    exp(i yaw) of the keyframes.
+    exp(i yaw) of the keyframes; `start` numbers the place about which they were chosen.
     """
 
     place: Array
@@ -62,11 +66,17 @@ class Fit:
     outward: float
     yaw: float = 0.0
     facing: complex = 0j
+    start: int = 0
 
     @property
     def explained(self) -> float:
         """The part of the image that its place explains, 0 to 1."""
         return 1 / (1 + self.unlike)
+
+    @property
+    def evidence(self) -> float:
+        """ln p(image | fit), up to a constant: see location.py."""
+        return PARTS / 2 * math.log1p(1 / max(self.unlike, 1e-9))
 
 
 def regress(

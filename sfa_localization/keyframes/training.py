@@ -12,21 +12,20 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.data.statistics import evenly
-from sfa_localization.keyframes.correlation import LIKE_A_PLACE
+from sfa_localization.keyframes.closures import STRETCH_M
 from sfa_localization.keyframes.keyframes import FEWEST, Keyframes
 from sfa_localization.keyframes.regression import BORDER, Fit
+from sfa_localization.keyframes.texture import LIKE_A_PLACE
 
 LEAST, DENSITY = 2000, 2
-"""Keyframes of a model, 3 kB each: so many, or more where there are so many to a square meter: with
-a third of them, 16 m x 18 m are known as well; smaller places show nearer things."""
-STRETCH_M = 3.0
-"""A keyframe is located without those of the same stretch of driving: they are too alike."""
-# Stretches of which keyframes are left out in turn, and how many neighbors of each, which show how
-# alike errors are.
+"""Keyframes of a model, 3 kB each: so many, or in large places so many per square meter. A third of
+them does as well on 16 m x 18 m; smaller places show nearer things."""
+# Keyframes are left out at so many places, and so many neighbors at each, whose errors are
+# correlated.
 _STRETCHES, _OF_EACH = 130, 3
-# Keyframes of a drive that are compared with those of others, and the least number; and the part of
-# images, by squares, that is alike everywhere and that no place explains, from which lights differ:
-# 0.03 to 0.1 between day, morning and overcast, 0.005 at most in the same light.
+# Keyframes of a drive that are compared with those of others, and the least number. Lights differ
+# where this part of images, by squares, is a residual that is the same everywhere: 0.03 to 0.1
+# between day, morning and overcast, 0.005 at most in the same light.
 _COMPARED, _FEWEST, _OF_LIGHT = 60, 20, 0.01
 
 
@@ -52,8 +51,8 @@ def choose_keyframes(
 def located_without(
     keyframes: Keyframes, path_m: Array
 ) -> tuple[Indices, list[Fit], NDArray[np.float64]]:
-    """Some keyframes (M,), where those of other stretches of driving put them, and how far the
-    nearest of these are, (M,) m. `path_m` (K,) is the distance driven until each.
+    """Some keyframes (M,), their fits among those of other stretches of driving, and the distance
+    (M,) m of the nearest of these. `path_m` (K,) is the distance driven until each keyframe.
     """
     first = evenly(len(keyframes.poses), _STRETCHES)[:, None] + np.arange(_OF_EACH)
     rows, fits, nearest = list[int](), list[Fit](), list[float]()
@@ -69,10 +68,10 @@ def located_without(
 
 
 def fit_among(keyframes: Keyframes, row: int, among: NDArray[np.bool_]) -> Fit | None:
-    """Where those `among` the keyframes (K,) put another one; None where it is like none of them,
-    or they are too few.
+    """The fit of a keyframe among others, by a mask (K,); None where it is like none of them, or
+    they are too few.
     """
-    image, others = keyframes.spectra([row])[0], keyframes.take(among)
+    image, others = keyframes.spectrum(row), keyframes.take(among)
     if len(others.poses) < FEWEST:
         return None
     scores, yaws = others.correlated(image)
@@ -98,8 +97,8 @@ def _by_light(keyframes: Keyframes) -> Keyframes:
 
 
 def _of_light(keyframes: Keyframes, rows: Indices, of_light: NDArray[np.bool_]) -> float:
-    """The part of the keyframes `rows` that those in a light do not explain and that is alike
-    everywhere: 0 in the same light, more in another; 1 where they do not meet.
+    """The part of the keyframes `rows` that is the same residual everywhere when they are fitted
+    among those of a light: 0 in the same light, more in another; 1 where they do not meet.
     """
     compared = rows[evenly(len(rows), _COMPARED)].tolist()
     fits = [fit_among(keyframes, row, of_light) for row in compared]

@@ -17,8 +17,7 @@ from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.rig import Quantity
 from sfa_localization.data.statistics import evenly
 from sfa_localization.keyframes.closures import Textures
-from sfa_localization.keyframes.correlation import correlate
-from sfa_localization.keyframes.texture import spectra_of
+from sfa_localization.keyframes.texture import correlate, spectra_of
 
 SPOT_M, TURNS_RAD = 0.02, (0.3, 1.5)
 """The two images of a turn are so near to each other, and turned by so much."""

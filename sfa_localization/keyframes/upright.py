@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 from sfa_localization.camera.leveling import TILTED_RAD, leveled
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.run import Image
-from sfa_localization.keyframes.correlation import LIKE_A_PLACE, coarse_scores
 from sfa_localization.keyframes.keyframes import Keyframes
-from sfa_localization.keyframes.texture import Spectra, spectrum, texture
+from sfa_localization.keyframes.texture import (
+    LIKE_A_PLACE,
+    Spectra,
+    coarse_scores,
+    spectrum,
+    texture,
+)
 from sfa_localization.keyframes.tilt import find_tilt, visible
 
 # The coarse correlation leaves so many keyframes for the full one.

@@ -19,11 +19,11 @@ from sfa_localization.data.errors import ModelError
 from sfa_localization.data.run import Run
 from sfa_localization.sfa.network import Architecture, Node
 from sfa_localization.sfa.network_training import Partial
-from sfa_localization.sfa.slowness import Solution
+from sfa_localization.sfa.slowness import LinearSfa
 
 FORMAT = 'sfa_localization training checkpoint'
 VERSION = 1
-# Images of each run that enter its fingerprint: enough to notice other recordings.
+# So many images of each run enter its fingerprint: enough to notice other recordings.
 _FINGERPRINT_IMAGES = 16
 
 
@@ -36,7 +36,7 @@ class Checkpoint:
 
     @classmethod
     def beside(cls, output: Path, settings: Sequence[object], runs: Sequence[Run]) -> Checkpoint:
-        """The checkpoint of training with `settings` on `runs`; others differ in fingerprint."""
+        """The checkpoint of training with `settings` on `runs`: its fingerprint depends on both."""
         digest = hashlib.sha256('\n'.join(map(repr, settings)).encode())
         for run in runs:
             digest.update(run.panoramas.stamps_ns.tobytes())
@@ -73,7 +73,7 @@ class Checkpoint:
         arrays = read_arrays(self.path, FORMAT, VERSION, remedy)
         header = json.loads(str(arrays['header']))
         if header['fingerprint'] != self.fingerprint:
-            raise ModelError(f'{self.path}: of other bags or parameters: {remedy}')
+            raise ModelError(f'{self.path}: made from other bags or parameters: {remedy}')
         ranks = tuple((int(a), int(b)) for a, b in header['ranks'])
         nodes = tuple(
             Node(*(arrays[f'{depth}/{item.name}'] for item in fields(Node)))
@@ -83,7 +83,7 @@ class Checkpoint:
         linear = None
         if header['linear_rank'] is not None:
             mean, weights, delta = (arrays[f'linear/{n}'] for n in ('mean', 'weights', 'delta'))
-            linear = Solution(mean, weights, delta, int(header['linear_rank']))
+            linear = LinearSfa(mean, weights, delta, int(header['linear_rank']))
         return Partial(architecture, nodes, linear, deltas, ranks)
 
     def remove(self) -> None:

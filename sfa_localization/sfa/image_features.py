@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a trained network outputs for all images of the drives, and statistics of it.
+"""The outputs of a trained network for all images of the drives, and their statistics.
 
 The sums over all views are those of section 2.2: features that code for the place vary between
 places, and not over the simulated rotation.
@@ -23,7 +23,7 @@ from sfa_localization.sfa.rotation import Map
 Spectrum = NDArray[np.complex64]
 
 TURNED_LAYER = 1
-"""Layer (0-based), below the top, whose map is turned to locate by: it still holds the heading."""
+"""Layer (0-based) below the top whose map is turned to locate by: it still shows the heading."""
 HARMONICS = 13
 """Mean and harmonics 1 to 12 over the columns; all 31 of a 60-column map locate no better."""
 
@@ -36,8 +36,8 @@ def slow_features(maps: list[Map]) -> Array:
 def spectrum(maps: Map, count: int = HARMONICS) -> Spectrum:
     """Harmonics 0, 1, ... of maps (T, rows, R, C) over the columns: (T, H, rows * C).
 
-    H is at most `count`, and only harmonics below R / 2, which a turn by a fraction of a column
-    leaves what they are. Scaled so that, with all of an odd R, squared norms are the maps'.
+    H is at most `count`, and harmonics are below R / 2: a turn by a fraction of a column only
+    shifts the phases of these. With all harmonics of an odd R, squared norms are those of the maps.
     """
     columns = maps.shape[2]
     order = np.arange(min(count, (columns + 1) // 2))

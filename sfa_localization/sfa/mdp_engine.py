@@ -3,7 +3,7 @@
 """The reference engine: the same hierarchy from MDP's nodes, trained on really rotated images.
 
 It makes the paper's sequence, image after image at all rotations (section 2.2), and learns the
-same network as network_training.py, some hundred times slower. Its result is an ordinary Network.
+same network as network_training.py, hundreds of times slower.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from sfa_localization.sfa.network_training import (
     shards_of,
 )
 from sfa_localization.sfa.rotation import Field
-from sfa_localization.sfa.slowness import Solution, signed, whitening
+from sfa_localization.sfa.slowness import LinearSfa, signed, whitening
 
 
 def train_network(
@@ -43,7 +43,7 @@ def train_network(
 ) -> Network:
     """Train all layers, as network_training.train_network does.
 
-    `on_shard` receives the number of images worked through since the last call.
+    `on_shard` receives the number of images since its last call.
     Raises ConfigError without MDP, and DataError when the images vary too little.
     """
     require_pairs(sequences)
@@ -76,7 +76,7 @@ def train_flow(
 
 
 def _unwrapped(error: BaseException) -> DataError:
-    """The cause of MDP's failure, from inside the long report that it raises."""
+    """The cause of MDP's failure, taken from its long report."""
     inner: BaseException | None = error
     while inner is not None:
         if isinstance(inner, DataError):
@@ -137,11 +137,6 @@ def _sfa_node(mdp: Any, inputs: int, outputs: int, relative_cut: float) -> Any:
     ) -> tuple[Array, Array]:
         white = whitening(covariance, relative_cut, outputs)
         dfc_out.rank_deficit = inputs - white.shape[1]
-        if white.shape[1] < outputs:
-            raise DataError(
-                f'the signal has rank {white.shape[1]}, fewer than the {outputs} slow features '
-                'asked for: record more varied images or ask for fewer'
-            )
         delta, turn = mdp.utils.symeig(white.T @ difference @ white, range=(1, outputs))
         return delta, signed(white @ turn)
 
@@ -190,7 +185,7 @@ def network_of(flow: Any, architecture: Architecture) -> Network:
     """The trained weights of a flow as a network."""
     trained = [layer.node for layer in flow if layer.is_trainable()]
     solutions = [
-        Solution(node.avg, node.sf, node.d, node.input_dim - node.rank_deficit) for node in trained
+        LinearSfa(node.avg, node.sf, node.d, node.input_dim - node.rank_deficit) for node in trained
     ]
     pairs = list(zip(solutions[::2], solutions[1::2], strict=True))
     return Network(

@@ -21,7 +21,7 @@ from sfa_localization.data.errors import ConfigError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.sfa.rotation import Field, Map, unfold
-from sfa_localization.sfa.slowness import Solution
+from sfa_localization.sfa.slowness import LinearSfa
 
 Weights = NDArray[np.float32]
 
@@ -143,7 +143,7 @@ SMALL_LAYERS = (
 )
 
 STANDARD_NETWORKS = {(30, 300): PAPER_LAYERS, (40, 320): SMALL_LAYERS}
-"""Grid -> layers; the first is for panoramas of all sizes but those of the others' grids."""
+"""Layers by grid; the first grid is for panoramas of all sizes that are not a grid themselves."""
 
 
 def standard_architecture(size: tuple[int, int], normalization: str) -> Architecture:
@@ -165,11 +165,11 @@ class Node:
     slow_offset: Weights
 
     @classmethod
-    def from_solutions(cls, linear: Solution, slow: Solution) -> Node:
+    def from_solutions(cls, linear: LinearSfa, slow: LinearSfa) -> Node:
         return cls(*folded(linear), *folded(slow))
 
 
-def folded(solution: Solution) -> tuple[Weights, Weights]:
+def folded(solution: LinearSfa) -> tuple[Weights, Weights]:
     """Weights (D, K) of a solution, and its mean as an offset (K,): x weights - offset."""
     weights = solution.weights.astype(np.float32)
     return weights, (solution.mean @ solution.weights).astype(np.float32)
@@ -177,20 +177,8 @@ def folded(solution: Solution) -> tuple[Weights, Weights]:
 
 def expand(z: Map) -> Map:
     """All monomials of degree 1 and 2 of signals (L, ...): (L + L (L + 1) / 2, ...)."""
-    n = len(z)
-    out = np.empty((n + n * (n + 1) // 2, *z.shape[1:]), z.dtype)
-    expand_into(z, out)
-    return out
-
-
-def expand_into(z: Map, out: Map) -> None:
-    """Write the monomials of z (L, ...) into `out`."""
-    n = len(z)
-    out[:n] = z
-    at = n
-    for i in range(n):
-        np.multiply(z[i:], z[i], out=out[at : at + n - i])
-        at += n - i
+    i, j = np.triu_indices(len(z))
+    return np.concatenate([z, z[i] * z[j]])
 
 
 def input_map(images: Image, architecture: Architecture) -> Map:
@@ -215,9 +203,8 @@ def require_size(images: Image, architecture: Architecture) -> None:
 
 
 def resampled(image: Image, grid: tuple[int, int]) -> Image:
-    """A panorama (H, W, C) at the size (rows, columns) of a grid; its ends belong together.
-
-    Pixels are averaged where they are too many, and interpolated where they are too few.
+    """A panorama (H, W, C), resampled to (rows, columns) and wrapped around at its ends: averaged
+    along an axis with more pixels than the grid, interpolated along one with fewer.
     """
     rows, columns = grid
     height, width = min(image.shape[0], rows), min(image.shape[1], columns)
@@ -235,18 +222,7 @@ def resampled(image: Image, grid: tuple[int, int]) -> Image:
 
 
 def _unnormalized(image: Image) -> Map:
-    channels = image.shape[2]
-    return _affine(image, np.full(channels, 1 / 128), np.full(channels, -1.0))
-
-
-def _affine(image: Image, gain: Array, offset: Array) -> Map:
-    """image * gain + offset, both per channel (C,): (H, W, C) float32."""
-    rows, columns, _ = image.shape
-    out = np.multiply(
-        image.reshape(rows, -1), np.tile(gain.astype(np.float32), columns), dtype=np.float32
-    )
-    out += np.tile(offset.astype(np.float32), columns)
-    return out.reshape(image.shape)
+    return np.asarray(image / np.float32(128) - 1, np.float32)
 
 
 def _gray(image: Image) -> Map:
@@ -255,9 +231,9 @@ def _gray(image: Image) -> Map:
 
 def _per_panorama(image: Image) -> Map:
     """Zero mean and unit scale of each channel over the whole image: independent of exposure."""
-    mean, std = (np.asarray(part).ravel() for part in cv2.meanStdDev(image))
-    gain = 1 / np.maximum(std, 1.0)
-    return _affine(image, gain, -mean * gain)
+    pixels = np.asarray(image, np.float32)
+    scale = np.maximum(pixels.std((0, 1)), 1)
+    return np.asarray((pixels - pixels.mean((0, 1))) / scale, np.float32)
 
 
 _NORMALIZATIONS = {
@@ -270,21 +246,8 @@ NORMALIZATIONS = tuple(_NORMALIZATIONS)
 
 def linear_stage(below: Map, receptive: Field, linear: Weights, offset: Weights) -> Map:
     """First half of a layer: reduced signals (L, rows, R) of one map (rows, R, channels)."""
-    fields = unfold(below[None], receptive)[0]
-    # Of rows that overlap in memory, NumPy 1 makes a product without BLAS, in 40 times as long.
-    rows = np.ascontiguousarray(fields.reshape(-1, fields.shape[-1]))
-    reduced = rows @ linear - offset
-    return np.ascontiguousarray(reduced.T).reshape(-1, *fields.shape[:2])
-
-
-def slow_stage(reduced: Map, node: Node, clip: float, out: Map) -> None:
-    """Second half: slow features of reduced signals (L, rows, R) into (rows, R, K), clipped."""
-    expanded = expand(reduced.reshape(len(reduced), -1))
-    slow = out.reshape(-1, out.shape[-1])
-    np.matmul(expanded.T, node.slow, out=slow)
-    slow -= node.slow_offset
-    np.minimum(slow, np.float32(clip), out=slow)
-    np.maximum(slow, np.float32(-clip), out=slow)
+    reduced = unfold(below[None], receptive)[0] @ linear - offset
+    return np.asarray(np.moveaxis(reduced, -1, 0), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,13 +266,12 @@ class Network:
         """Output map of layer `depth` (0-based) from the map below."""
         node, layer = self.nodes[depth], self.architecture.layers[depth]
         receptive = self.architecture.fields[depth]
-        count, rows, columns, _ = maps.shape
-        out = np.empty((count, receptive.rows_out(rows), columns, layer.outputs), np.float32)
-        # One image at a time: its signals stay in the processor's cache.
-        for below, above in zip(maps, out, strict=True):
+        above = []
+        for below in maps:  # the monomials of all images at once would need much memory
             reduced = linear_stage(below, receptive, node.linear, node.linear_offset)
-            slow_stage(reduced, node, layer.clip, above)
-        return out
+            slow = np.moveaxis(expand(reduced), 0, -1) @ node.slow - node.slow_offset
+            above.append(np.clip(slow, -layer.clip, layer.clip))
+        return np.stack(above)
 
     def maps(self, images: Image) -> list[Map]:
         """Every layer's output map (T, rows, R, outputs) for panoramas (T, H, W, C)."""
@@ -322,7 +284,7 @@ class Network:
 
 
 def check_weights(network: Network) -> None:
-    """Require weights of the sizes that the architecture has. Raises ModelError."""
+    """Raise ModelError unless the weights have the sizes of the architecture."""
     architecture = network.architecture
     levels = zip(
         network.nodes,

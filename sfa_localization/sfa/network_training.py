@@ -26,22 +26,23 @@ from sfa_localization.sfa.network import (
     Architecture,
     Network,
     Node,
-    expand_into,
+    expand,
     folded,
     input_map,
     linear_stage,
 )
 from sfa_localization.sfa.rotation import FieldStatistics, Map, SampleStatistics, Sums
-from sfa_localization.sfa.slowness import Solution, Statistics, solve
+from sfa_localization.sfa.slowness import LinearSfa, Statistics, solve
 
 SHARD = 64
-"""Images whose sums are computed by one task: enough for its products, few enough to balance."""
+"""Images of one task: enough for efficient products, few enough to balance the cores."""
 MOST = 3500
-"""Images that the network is trained on, of longer drives some of each shard, so that its time does
-not grow with the place: 32 m x 36 m are as good with them as 16 m x 18 m are with all of theirs."""
+"""The network is trained on so many images, of longer drives on some of each shard. More of them
+would be no better on 32 m x 36 m than on 16 m x 18 m, and take longer."""
 BREAK_TIME_S = 5.0
 BREAK_DISTANCE_M = 2.0
-"""Consecutive images farther apart than either are no neighbors: the drive was interrupted."""
+"""Consecutive images with more than either between them are not neighbors: the drive was
+interrupted."""
 LIGHT_STD = 0.3
 """Standard deviation of the logarithmic gain of each training image: features must not code for
 exposure, which changes more between days than within one drive."""
@@ -71,8 +72,8 @@ class ImageSequence:
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """Images start .. stop - 1 of a sequence, with the pair that leads into them, for those until
-    `end`. The light of each image is changed at random, by `seed` and the image's number.
+    """Images start .. stop - 1 of a sequence, with the pair that leads into them; they stand for
+    the images until `end`. The light of each image is changed at random, by `seed` and its number.
     """
 
     sequence: ImageSequence
@@ -103,13 +104,13 @@ class Shard:
 
 
 def _gain(std: float, seed: Sequence[int]) -> NDArray[np.float32]:
-    """Random exposure and color balance (3,) of one image, always the same for it."""
+    """Random exposure and color balance (3,) of an image, always the same for this image."""
     normal = np.random.default_rng(seed).standard_normal(4).astype(np.float32)
     return np.asarray(np.exp(std * (normal[0] + normal[1:] / 3)), np.float32)
 
 
 def _summed(partial: Partial, shards: Sequence[Shard], on_shard: Callable[[int], object]) -> Sums:
-    """Sums of the stage that comes next over all shards, merged in their order."""
+    """Sums of the next stage over all shards, merged in their order."""
     total = _sums(partial)
     for part, shard in zip(_in_threads(partial, shards), shards, strict=True):
         total.merge(part)
@@ -144,12 +145,12 @@ def cores() -> int:
 class Partial:
     """A partly trained network: finished layers, and perhaps the linear half of the next one.
 
-    `stages` counts the finished halves of layers; `rotate`: the simulated rotation is not left out.
+    `stages` counts the finished halves of layers; without `rotate` there is no simulated rotation.
     """
 
     architecture: Architecture
     nodes: tuple[Node, ...] = ()
-    linear: Solution | None = None
+    linear: LinearSfa | None = None
     deltas: tuple[NDArray[np.float64], ...] = field(default=())
     ranks: tuple[tuple[int, int], ...] = field(default=())
     rotate: bool = True
@@ -185,7 +186,7 @@ class Partial:
 
 
 def stage_sums(partial: Partial, shard: Shard) -> Sums:
-    """Sums of the stage that comes next, over one shard."""
+    """Sums of the next stage over one shard."""
     network = partial.network()
     sums = _sums(partial)
     signals = _signals(partial)
@@ -204,7 +205,7 @@ def stage_sums(partial: Partial, shard: Shard) -> Sums:
 
 
 def _sums(partial: Partial) -> Sums:
-    """Empty sums for the stage that comes next."""
+    """Empty sums for the next stage."""
     architecture, depth = partial.architecture, partial.depth
     layer, receptive = architecture.layers[depth], architecture.fields[depth]
     if partial.linear is not None:
@@ -214,25 +215,21 @@ def _sums(partial: Partial) -> Sums:
 
 
 def _signals(partial: Partial) -> Callable[[Map], Map]:
-    """From the maps below to the signals whose SFA comes next."""
+    """The function from the maps below to the signals of the next SFA."""
     if partial.linear is None:
         return lambda maps: maps
     receptive = partial.architecture.fields[partial.depth]
     linear, offset = folded(partial.linear)
 
     def expanded(maps: Map) -> Map:
-        dimensions = partial.architecture.layers[partial.depth].expanded
-        rows = receptive.rows_out(maps.shape[1])
-        out = np.empty((dimensions, len(maps), rows, maps.shape[2]), np.float32)
-        for t, below in enumerate(maps):
-            expand_into(linear_stage(below, receptive, linear, offset), out[:, t])
-        return out
+        reduced = [linear_stage(below, receptive, linear, offset) for below in maps]
+        return expand(np.stack(reduced, axis=1))
 
     return expanded
 
 
 def _below(network: Network, images: Image) -> Map:
-    """Input map of the layer above all of the network's."""
+    """The input map of the first layer that is not trained yet."""
     maps = input_map(images, network.architecture)
     for depth in range(len(network.nodes)):
         maps = network.layer(maps, depth)
@@ -242,7 +239,7 @@ def _below(network: Network, images: Image) -> Map:
 def shards_of(
     sequences: Sequence[ImageSequence], seed: int, light_std: float = LIGHT_STD
 ) -> list[Shard]:
-    """All sequences cut into shards of equal length, of which at most `MOST` images are used."""
+    """All sequences cut into shards of equal length, with at most `MOST` images in all."""
     images = sum(len(s.panoramas) for s in sequences)
     used = max(math.ceil(SHARD * MOST / max(images, MOST)), 2)  # at least a pair
     shards = []
@@ -275,9 +272,9 @@ def train_network(
 ) -> Network:
     """Train all layers on the full simulated rotation of every sequence (section 2.2).
 
-    `rotate` false leaves out the simulated rotation, for comparison. `start` continues a training
-    that was interrupted; `on_stage` receives each finished stage,
-    `on_shard` the number of images worked through since the last call.
+    `rotate` false leaves out the simulated rotation, for comparison. `start` continues an
+    interrupted training; `on_stage` receives each finished stage, `on_shard` the number of images
+    since its last call.
     Raises DataError when the images vary too little.
     """
     require_pairs(sequences)

@@ -19,12 +19,11 @@ The rotation can be left out, for comparison: then only the differences x_{t+1,c
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, Mask
@@ -64,30 +63,14 @@ def strips(maps: Map, field: Field) -> Map:
 
 def unfold(maps: Map, field: Field) -> Map:
     """All fields: (T, rows_out, R, field.columns * field.rows * channels), columns outermost."""
-    return windows(strips(maps, field), field.columns, field.spacing)
+    return shifted(strips(maps, field), range(0, field.columns * field.spacing, field.spacing))
 
 
-def windows(columns: Map, count: int, spacing: int) -> Map:
-    """The columns c, c + spacing, ... (cyclic), `count` of them: (..., R, count * P)."""
-    *lead, period, width = columns.shape
-    wrapped = np.concatenate([columns, columns[..., : (count - 1) * spacing, :]], axis=-2)
-    step = wrapped.strides[-2]
-    shape = (*lead, period, count, width)
-    strides = (*wrapped.strides[:-1], spacing * step, wrapped.strides[-1])
-    return as_strided(wrapped, shape, strides, writeable=False).reshape(*lead, period, -1)
-
-
-def shifted(columns: Map, shifts: list[int]) -> Map:
-    """Stack the columns c + shift (cyclic) for every shift: (..., R, len(shifts) * P)."""
-    width = columns.shape[-1]
+def shifted(columns: Map, shifts: Sequence[int]) -> Map:
+    """Beside each other the columns c + shift (cyclic) of each shift: (..., R, len(shifts) * P)."""
     period = columns.shape[-2]
-    out = np.empty((*columns.shape[:-1], len(shifts) * width), columns.dtype)
-    for i, shift in enumerate(shifts):
-        part = out[..., i * width : (i + 1) * width]
-        k = shift % period
-        part[..., : period - k, :] = columns[..., k:, :]
-        part[..., period - k :, :] = columns[..., :k, :]
-    return out
+    index = (np.arange(period)[:, None] + np.array(shifts)) % period
+    return np.asarray(columns[..., index, :].reshape(*columns.shape[:-1], -1))
 
 
 class Sums(Protocol):
@@ -138,11 +121,11 @@ class FieldStatistics:
         self.samples += columns.shape[0] * columns.shape[1]
         self.total += columns.sum((0, 1, 2), dtype=np.float64)
         self.same += _product(columns, shifted(columns, self.lags))
-        difference = _between_images(columns, self._last, joined, int(self.rotate))
+        difference = _between_images(columns, self._last, joined, self.rotate, time=0)
         self.pairs += difference.shape[0] * difference.shape[1]
         if len(difference):
-            neighbors = windows(difference, self.field.columns, self.field.spacing)
-            self.between += _product(difference, neighbors)
+            steps = range(0, self.field.columns * self.field.spacing, self.field.spacing)
+            self.between += _product(difference, shifted(difference, steps))
         self._last = columns[-1:]
 
     def merge(self, other: FieldStatistics) -> None:
@@ -187,12 +170,17 @@ class FieldStatistics:
         return self.between[:, at * p : (at + 1) * p]
 
 
-def _between_images(columns: Map, last: Map | None, joined: Mask, turn: int) -> Map:
-    """x_{t,c} - x_{t-1,c-turn} of the pairs that are joined: (pairs, rows, R, P)."""
+def _between_images(signals: Map, last: Map | None, joined: Mask, rotate: bool, time: int) -> Map:
+    """x_{t,c} - x_{t-1,c-1} of the pairs that are joined, or x_{t,c} - x_{t-1,c} without rotation,
+    along the axis `time`; columns are two axes behind it, and `last` comes before the first image.
+    """
+    seconds = np.flatnonzero(joined)
     if last is None:
-        columns, last, joined = columns[1:], columns[:1], joined[1:]
-    before = np.concatenate([last, columns[:-1]]) if len(columns) else columns
-    return np.asarray(columns[joined] - np.roll(before[joined], turn, axis=2))
+        seconds = seconds[seconds > 0]
+    else:
+        signals, seconds = np.concatenate([last, signals], axis=time), seconds + 1
+    before = np.roll(signals.take(seconds - 1, axis=time), int(rotate), axis=time + 2)
+    return np.asarray(signals.take(seconds, axis=time) - before)
 
 
 def _product(a: Map, b: Map) -> Map:
@@ -212,16 +200,18 @@ class SampleStatistics:
         self._last: Map | None = None
 
     def lead(self, maps: Map) -> None:
-        self._last = maps[:, -1]
+        self._last = maps[:, -1:]
 
     def add(self, maps: Map, joined: Mask) -> None:
         self.samples += maps.shape[1] * maps.shape[2]
         self.total += maps.sum((1, 2, 3), dtype=np.float64)
         self.second += _square(maps)
         if self.rotate:
-            self.within += _square(_turned(maps))
-        self._add_pairs(maps, joined)
-        self._last = maps[:, -1].copy()
+            self.within += _square(np.roll(maps, -1, axis=-1) - maps)
+        pairs = _between_images(maps, self._last, joined, self.rotate, time=1)
+        self.between += _square(pairs)
+        self.pairs += pairs.shape[1] * pairs.shape[2]
+        self._last = maps[:, -1:].copy()
 
     def merge(self, other: SampleStatistics) -> None:
         self.samples += other.samples
@@ -238,34 +228,6 @@ class SampleStatistics:
         return Statistics(
             float(self.samples * r), self.total, self.second, float(steps), difference
         )
-
-    def _add_pairs(self, maps: Map, joined: Mask) -> None:
-        """Add x_{t,c} - x_{t-1,c-1}, cyclic in the last axis, of the pairs that are joined; without
-        rotation x_{t,c} - x_{t-1,c}.
-        """
-        seconds = np.flatnonzero(joined)
-        if self._last is None:
-            seconds = seconds[seconds > 0]
-        pairs = np.empty((len(maps), len(seconds), *maps.shape[2:]), maps.dtype)
-        for k, t in enumerate(seconds.tolist()):
-            before = self._last if t == 0 else maps[:, t - 1]
-            assert before is not None
-            if not self.rotate:
-                np.subtract(maps[:, t], before, out=pairs[:, k])
-                continue
-            np.subtract(maps[:, t, :, 1:], before[..., :-1], out=pairs[:, k, :, 1:])
-            np.subtract(maps[:, t, :, 0], before[..., -1], out=pairs[:, k, :, 0])
-        if len(seconds):
-            self.between += _square(pairs)
-            self.pairs += pairs.shape[1] * pairs.shape[2]
-
-
-def _turned(signals: Map) -> Map:
-    """Differences between columns one rotation step apart (cyclic)."""
-    out = np.empty_like(signals)
-    np.subtract(signals[..., 1:], signals[..., :-1], out=out[..., :-1])
-    np.subtract(signals[..., 0], signals[..., -1], out=out[..., -1])
-    return out
 
 
 def _square(signals: Map) -> Map:

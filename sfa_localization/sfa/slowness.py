@@ -45,7 +45,7 @@ class Statistics:
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
+class LinearSfa:
     """Linear slow features s = (x - mean) weights, slowest first.
 
     `mean` (D,), `weights` (D, K), `delta` (K,) the Delta values <ds^2>, `rank` the number of
@@ -62,7 +62,7 @@ class Solution:
         return np.asarray((x - self.mean) @ self.weights)
 
 
-def solve(statistics: Statistics, outputs: int, relative_cut: float) -> Solution:
+def solve(statistics: Statistics, outputs: int, relative_cut: float) -> LinearSfa:
     """Slowest `outputs` directions of unit variance, decorrelated, in order of Delta.
 
     Directions whose variance is below `relative_cut` times the largest are dropped first (C is
@@ -74,28 +74,27 @@ def solve(statistics: Statistics, outputs: int, relative_cut: float) -> Solution
         raise DataError('SFA needs at least two consecutive samples')
     mean, covariance = statistics.covariance()
     white = whitening(covariance, relative_cut, outputs)
-    rank = white.shape[1]
-    if rank < outputs:
-        raise DataError(
-            f'the signal has rank {rank}, fewer than the {outputs} slow features asked for: '
-            'record more varied images or ask for fewer'
-        )
     from scipy import linalg  # for training alone
 
     slow = white.T @ (statistics.difference / statistics.steps) @ white
     delta, rotation = linalg.eigh((slow + slow.T) / 2, subset_by_index=[0, outputs - 1])
     weights = signed(white @ rotation)
-    return Solution(mean, weights, delta, rank)
+    return LinearSfa(mean, weights, delta, white.shape[1])
 
 
 def whitening(covariance: Array, relative_cut: float, least: int) -> Array:
     """Matrix (D, rank) that makes the kept part of a signal of this covariance (D, D) white.
 
-    At least `least` directions are kept, unless they are rounding errors.
+    At least `least` directions are kept. Raises DataError where fewer are above rounding errors.
     """
     variance, axes = np.linalg.eigh(covariance)
     cut = min(relative_cut * variance[-1], variance[-min(least, len(variance))])
     kept = (variance >= cut) & (variance > max(_ROUNDING * variance[-1], np.finfo(float).tiny))
+    if kept.sum() < least:
+        raise DataError(
+            f'the signal has rank {kept.sum()}, fewer than the {least} slow features asked for: '
+            'record more varied images or ask for fewer'
+        )
     return np.asarray(axes[:, kept] / np.sqrt(variance[kept]))
 
 

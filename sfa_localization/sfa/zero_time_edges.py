@@ -1,10 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Edges of no time between drives: one place in another light is one moment to slowness.
+"""Loop closures between drives as neighbors in the training sequence, with no time between them.
 
-What differs between two images of a loop closure is light, or season, but not the place. As
-neighbors in the training sequence they make slow only what both lights show alike: what sets
-the drives apart would otherwise be the slowest feature of all.
+The two images of a closure differ in light, or season, but not in place. As neighbors they make
+only such features slow that are alike in both lights. Without them, the difference between the
+drives would be the slowest feature of all.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from sfa_localization.keyframes.closures import Closures
 from sfa_localization.sfa.network_training import ImageSequence
 
 _MOST = 200
-"""Edges of a training: enough for statistics, a small part of its time."""
+"""Most edges of a training: enough for statistics, in a small part of its time."""
 
 
 @dataclass(frozen=True, slots=True)
 class PairedPanoramas:
-    """The images of loop closures, a, b, a, b: each b turned to the heading of its a, and by one
-    rotation step more, as the simulated rotation expects of neighbors.
+    """The images a, b of each of E loop closures: b is turned to the heading of a and one rotation
+    step farther, as the simulated rotation expects of neighbors.
 
-    `drives` in order, `pairs` (E, 2) indices among all of their images, `columns` (E,) to turn by.
+    `pairs` (E, 2) are indices among the images of all `drives`; b is turned by `columns` (E,).
     """
 
     drives: tuple[Panoramas, ...]
@@ -68,8 +68,8 @@ class PairedPanoramas:
 def edges_between(
     drives: Sequence[Panoramas], closures: Closures, rotations: int, clockwise: bool
 ) -> list[ImageSequence]:
-    """The closures between different drives as a sequence for a network of so many rotations;
-    none without any.
+    """The closures between different drives as a sequence for a network of so many rotations; no
+    sequence without closures.
     """
     starts = np.cumsum([0, *(len(drive) for drive in drives)])
     drive = np.searchsorted(starts, closures.images, 'right')

@@ -18,7 +18,7 @@ from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.run import Odometry, Run
 from sfa_localization.evaluation import evaluate
 from sfa_localization.keyframes.light import Conditions
-from sfa_localization.keyframes.location import Hypothesis, Location
+from sfa_localization.keyframes.location import Location
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE
 from sfa_localization.metric.learning import MetricResult, learn_metric
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -111,11 +111,11 @@ class SlowFeaturesAlone(PlaceModel):
 
     def located(self, view: View, conditions: Conditions) -> Location:
         location = PlaceModel.located(self, view, conditions)
-        (slow,) = self._slow_places(view, [Hypothesis(location.fit, 0)])
-        claimed, unlike = np.array([slow.variance]), np.array([location.fit.unlike])
+        places, claimed = self._slow_places(view, [location.fit])
+        unlike = np.array([location.fit.unlike])
         (variance,) = self.keyframes.errors.slow_variance(claimed, unlike)
         covariance = np.diag([variance, variance, UNKNOWN_YAW_VARIANCE])
-        return replace(location, pose=np.append(slow.place, 0.0), covariance=covariance)
+        return replace(location, pose=np.append(places[0], 0.0), covariance=covariance)
 
 
 @dataclass(frozen=True, slots=True)
