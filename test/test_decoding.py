@@ -97,12 +97,12 @@ def test_panoramas_of_a_bag_are_leveled_by_its_imu(tmp_path):
     image = np.random.default_rng(0).integers(0, 256, (12, 72, 3), np.uint8)
     recipe = ReadingRecipe(camera=CameraConfig(level_by_imu=True))
 
-    def recorded(name, late_ns=0, known=True):
+    def recorded(name, late_ns=0, measured=True):
         with BagWriter(tmp_path / name) as bag:
             for k in range(4):
                 at, sent = START + k * 10**9, imu_of(0.1 * k, -0.05)
                 sent.header.stamp.sec, sent.header.stamp.nanosec = divmod(at + late_ns, 10**9)
-                sent.orientation_covariance[0] = 0.0 if known else -1.0
+                sent.orientation_covariance[0] = 0.0 if measured else -1.0
                 bag.odometry('/odom', at, (0.1 * k, 0, 0), (0.1, 0), (0, 0))
                 bag.image('/panorama', at, image, 'camera')
                 bag.message('/imu', at, sent)
@@ -111,10 +111,10 @@ def test_panoramas_of_a_bag_are_leveled_by_its_imu(tmp_path):
     run = read_drive(recorded('bag'), tmp_path / 'cache', recipe)
     expected = [leveled(image, (0.1 * k, -0.05), recipe.panorama.sphere) for k in range(4)]
     off = run.panoramas.read(0, 4).astype(int) - expected
-    assert np.abs(off).max() <= 1 and len({one.tobytes() for one in expected}) == 4
+    assert np.abs(off).max() <= 1 and len({level.tobytes() for level in expected}) == 4
     assert inspect(tmp_path / 'bag').facts['ground'] == 'tilts the robot by 3.2 degrees'
     for given, reason in (({'late_ns': 10**7}, ''), ({'late_ns': 5 * 10**9}, 'near 4 of 4 images'),
-                          ({'known': False}, 'no orientation')):  # fmt: skip
+                          ({'measured': False}, 'no orientation')):  # fmt: skip
         path = recorded(f'{given}', **given)
         with pytest.raises(BagError, match=reason) if reason else nullcontext():
             read_drive(path, tmp_path / 'cache', recipe)

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The variances of places are learned from errors: found again in errors that were drawn so."""
+"""The variances of places are learned from errors: learned again in errors that were drawn so."""
 
 from dataclasses import astuple, replace
 
@@ -29,18 +29,18 @@ def drawn(seed: int = 0, common: float = 0.0):
     return trials, slow + common * (error - slow), claimed
 
 
-def test_the_parameters_are_found_again():
+def test_the_parameters_of_drawn_errors_are_learned():
     trials, *slow = drawn()
-    found = trials.learn_slow(trials.learn(), *slow)
-    np.testing.assert_allclose(astuple(found), astuple(TRUE), rtol=0.1)
+    learned = trials.learn_slow(trials.learn(), *slow)
+    np.testing.assert_allclose(astuple(learned), astuple(TRUE), rtol=0.1)
 
 
 def test_what_errs_in_both_is_counted():
     """95 % ellipses hold 84 % of Student's errors: 1 - (1 + 5.99 / 4)^-2."""
     for common in (0.0, 0.95):
         trials, *slow = drawn(1, common)
-        found = trials.learn_slow(trials.learn(), *slow)
-        error, variance = trials.fused(found, *slow)
+        learned = trials.learn_slow(trials.learn(), *slow)
+        error, variance = trials.fused(learned, *slow)
         assert share_within((error**2).sum(1) / variance, 0.95, trials.weight) > 0.8
         mean, by_keyframes = np.hypot(*error.T).mean(), np.hypot(*trials.error.T).mean()
         assert mean < by_keyframes and (mean < 0.8 * by_keyframes) == (common == 0.0)
@@ -50,6 +50,6 @@ def test_images_of_no_weight_change_nothing():
     trials, *_ = drawn()
     weight = np.where(np.arange(COUNT) < COUNT // 2, 2.0, 0.0) / COUNT
     spoilt = np.where(weight[:, None] > 0, 1.0, 30.0) * trials.error
-    found = replace(trials, weight=weight, error=spoilt).learn()
-    assert astuple(found) == pytest.approx(astuple(replace(trials, weight=weight).learn()))
-    assert found.floor_m < 0.3 * replace(trials, error=spoilt).learn().floor_m
+    learned = replace(trials, weight=weight, error=spoilt).learn()
+    assert astuple(learned) == pytest.approx(astuple(replace(trials, weight=weight).learn()))
+    assert learned.floor_m < 0.3 * replace(trials, error=spoilt).learn().floor_m
