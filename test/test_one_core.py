@@ -119,7 +119,7 @@ def test_live_nodes_localizer_and_evaluate_give_the_same_poses(tmp_path, monkeyp
 
     # The pictures were what they are meant to be, and the filter knew where it was.
     assert judged.counts['observations']['skipped'] == {
-        'image is unlike any of training': 4,
+        'image is unlike all training images': 4,
         'image is dark': 2,
         'image is covered: it shows nothing': 1,
         'image repeats the one before': 3,

@@ -77,8 +77,8 @@ def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
     """Find the rim of the mirror, and its hole, in images (H, W, 3) of one size.
 
     Just outside of the rim the image is dark or, in several images taken while driving, does not
-    change; the cue that shows the circle more clearly counts. So does the image just inside of the
-    hole. Raises CameraError when no circle stands out.
+    change; the cue with the clearer circle counts. The same holds just inside of the hole. Raises
+    CameraError when no circle stands out.
     """
     rng = np.random.default_rng(seed)
     scale = min(_SEARCHED_PX / max(images[0].shape), 1.0)
@@ -263,9 +263,8 @@ def calibrate(
 ) -> LensCalibration:
     """The lens from a calibration file, or from the circle in images (H, W, 3).
 
-    `given` holds fields of LensCalibration that take precedence; its circle replaces that of the
-    images, and its radii limit what is visible of a lens from a file. Raises CameraError when this
-    is not enough.
+    `given` holds fields of LensCalibration that take precedence; a circle in it replaces that of
+    the images, and radii in it limit the visible part of a lens from a file. Raises CameraError.
     """
     if calibration_file is not None:
         used = {name: value for name, value in given.items() if name not in _CIRCLE[:2]}

@@ -41,7 +41,7 @@ def _bar(items: Iterable[T] | None, desc: str, total: int | None, unit: str, **o
 def progress_bar(
     desc: str, total: int | None = None, unit: str = 'images', initial: int = 0, *, shown: bool
 ) -> Any:
-    """A context manager with `update(n)`, `n` and `total`; not `shown`, it counts silently."""
+    """A context manager with `update(n)`, `n` and `total`; if not `shown`, it counts silently."""
     return _bar(None, desc, total, unit, initial=initial, disable=not shown)
 
 

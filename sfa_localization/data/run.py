@@ -77,8 +77,8 @@ class Odometry:
     """Wheel odometry: poses in the odom frame and the twist that moved them.
 
     `stamps_ns` (N,), `poses` (N, 3), `twists` (N, 2) as v m/s, omega rad/s; `variances` (N, 2) of
-    v and omega as in the messages, 0 where unknown. A twist is the mean over the time since the
-    previous message, as drivers of wheel encoders publish it; the first is not used. `part` (N,)
+    v and omega as in the messages, 0 where unknown. A twist is the mean since the previous
+    message, as drivers of wheel encoders publish it; the first twist is not used. `part` (N,)
     numbers the unbroken parts, by default a single one: the motion between two parts is unknown.
     """
 
