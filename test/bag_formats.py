@@ -278,6 +278,6 @@ FORMATS = {
     'lone mcap, no index': lambda p, m: write_mcap(p / 'lone.mcap', m, index=False),
     'lone mcap, neither': lambda p, m: write_mcap(p / 'a.mcap', m, compression=None, index=False),
     'ROS 1': lambda p, m: write_ros1(p / 'lone.bag', m),
-    'ROS 1 bz2': lambda p, m: write_ros1(p / 'lone.bag', m, 'bz2'),
+    'ROS 1 bz2': lambda p, m: write_ros1(p / 'lone.bag', m, 'bz2', chunk_size=2000),
     'ROS 1 lz4': lambda p, m: write_ros1(p / 'lone.bag', m, 'lz4'),
 }

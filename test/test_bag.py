@@ -10,13 +10,11 @@ import bag_formats as formats
 import numpy as np
 import pytest
 from bag_formats import COUNTS, DELAY, FORMATS, IMAGES, PER_IMAGE, PERIOD, image, pose, stamp
-from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from sfa_localization.bags.drives import ReadingRecipe, read_drive
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import TopicNames
-from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.data.errors import BagError
 
@@ -65,6 +63,7 @@ def test_every_format_is_read_exactly(name, tmp_path, messages):
 
 @pytest.mark.parametrize('name', ['mcap', 'sqlite3', 'ROS 1 bz2'])
 def test_messages_come_in_order_of_reception_from_any_moment_on(name, tmp_path, messages):
+    """Also of a ROS 1 bag whose topics were written one after the other, in separate chunks."""
     stored = messages if name == 'mcap' else sorted(messages, key=lambda m: m.topic)
     parts = received(FORMATS[name](tmp_path / 'bag', stored))
     assert sorted(part[:2] for part in parts) == sorted((m.receive_ns, m.topic) for m in messages)
@@ -72,21 +71,6 @@ def test_messages_come_in_order_of_reception_from_any_moment_on(name, tmp_path, 
     middle = stamp(IMAGES / 2)
     later = [at for at, _, _ in received(tmp_path / 'bag', middle)]
     assert later == sorted(m.receive_ns for m in messages if m.receive_ns >= middle)
-
-
-def test_ros_1_topics_written_in_separate_chunks_are_read_whole(tmp_path):
-    """As tools that filter or merge bags write them."""
-    with BagWriter(tmp_path / 'drive', 'sqlite3') as writer:
-        for index in range(427):
-            picture = np.full((30, 300, 3), index % 256, np.uint8)
-            writer.image('/image', stamp(index), picture, 'camera')
-            writer.odometry('/odom', stamp(index), (0.5 * index, 0, 0), (5.0, 0), (0, 0))
-    with Reader(tmp_path / 'drive') as reader:
-        recorded = [formats.Message(c.topic, c.msgtype, *r) for c, *r in reader.messages()]
-    by_topic = sorted(recorded, key=lambda message: message.topic)
-    path = formats.write_ros1(tmp_path / 'a.bag', by_topic, 'lz4')
-    run = read_drive(path, tmp_path / 'cache', strict=True)
-    assert run.panoramas.stamps_ns.tolist() == [stamp(index) for index in range(427)]
 
 
 WRITERS = {

@@ -169,8 +169,8 @@ def test_roll_comes_first_then_pitch_then_yaw():
 
 
 def test_intrinsics_follow_the_size_of_the_picture():
-    large, small = (make_camera(LensCalibration(), size).project(rays()) for size in
-                    (SIZE, (320, 320)))  # fmt: skip
+    large, small = (make_camera(LensCalibration(), size).project(rays())
+                    for size in (SIZE, (320, 320)))  # fmt: skip
     both = np.isfinite(large[:, 0]) & np.isfinite(small[:, 0])
     np.testing.assert_allclose((small[both] + 0.5) * 2 - 0.5, large[both], atol=1e-9)
 
