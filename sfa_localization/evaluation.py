@@ -161,7 +161,7 @@ def observed(
     """
     run = _read(bag, recipe, progress, want_truth)
     images, title = observer.observe_run(run), f'locate the images of {run.name}'
-    return run, [*progress_over(images, title, len(run.panoramas), shown=progress)]
+    return run, [*progress_over(images, title, len(run.panoramas), visible=progress)]
 
 
 def _present(path: Path, recipe: Recipe) -> Recipe:
@@ -225,7 +225,7 @@ def _replayed(
     """Observations of all images; stamp, level and estimate at each odometry message."""
     observations, moments = list[Observation](), list[tuple[int, Level, State | None]]()
     title = f'locate the images of {run.name}'
-    with progress_bar(title, len(run.panoramas), shown=progress) as bar:
+    with progress_bar(title, len(run.panoramas), visible=progress) as bar:
         for stamp_ns, observation, state in localizer.replay(run):
             if observation is None:
                 moments.append((stamp_ns, localizer.status.level, state))

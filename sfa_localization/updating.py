@@ -132,7 +132,7 @@ def new_views(
     config = replace(config, degraded_std=config.lost_std)
     localizer = Localizer(model, config, watch, Smoother)
     seen, sure = [], []
-    with progress_bar(f'replay {run.name}', len(run.panoramas), shown=progress) as bar:
+    with progress_bar(f'replay {run.name}', len(run.panoramas), visible=progress) as bar:
         for _, observation, _ in localizer.replay(run):
             if observation is not None:
                 seen.append(observation)
