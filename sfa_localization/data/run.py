@@ -92,12 +92,6 @@ class Odometry:
         if len(self.part) == 0:
             object.__setattr__(self, 'part', np.zeros(len(self.stamps_ns), np.int64))
 
-    @classmethod
-    def along(cls, path: Trajectory) -> Odometry:
-        """Exact odometry of a path, of unknown variances: mean twists from pose to pose."""
-        twists = differences(path.stamps_ns, path.poses)
-        return cls(path.stamps_ns, path.poses, twists, np.zeros_like(twists))
-
     @property
     def trajectory(self) -> Trajectory:
         return Trajectory(self.stamps_ns, self.poses)
