@@ -61,7 +61,7 @@ class Trajectory:
 def _along(start: Array, end: Array, t: Array) -> Array:
     """Poses at a fraction t (M,) of the arc from start to end, both (M, 3).
 
-    The chord of an arc that turns by a points along a / 2, and is sinc(a / 2 pi) times the arc.
+    The chord of an arc of turn a has the bearing a / 2, and sin(a / 2) / (a / 2) of its length.
     """
     step = relative(start, end)
     half = step[:, 2] / 2
