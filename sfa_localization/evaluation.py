@@ -153,7 +153,7 @@ def observed(
 
 def _observations(run: Run, observer: Observer, progress: bool) -> Iterator[Observation]:
     title = f'locate the images of {run.name}'
-    return progress_over(observer.observe_run(run), title, len(run.panoramas), shown=progress)
+    return progress_over(observer.observe_run(run), title, len(run.panoramas), visible=progress)
 
 
 def _with_topics_of(path: Path, recipe: Recipe) -> Recipe:

@@ -133,7 +133,7 @@ def run_filter(
     steps = replay(fused, driven, *rows)
     total = len(twists) + len(positions.values)
     moved_ns, states, updates = None, dict[int, State](), list[Update]()
-    for stamp_ns, _, update in progress_over(steps, 'filter', total, 'rows', shown=progress):
+    for stamp_ns, _, update in progress_over(steps, 'filter', total, 'rows', visible=progress):
         if update is not None:
             updates.append(update)
         else:

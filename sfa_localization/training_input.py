@@ -64,9 +64,9 @@ class TrainingInput:
     def of(cls, runs: Sequence[Run], recipe: Recipe, progress: bool = False) -> TrainingInput:
         """Step 2: level the images, find loop closures, and with them calibrate the odometry."""
         total = sum(len(run.panoramas) for run in runs)
-        with progress_bar(titled(2, 'level the images'), shown=progress) as bar:
+        with progress_bar(titled(2, 'level the images'), visible=progress) as bar:
             runs = leveled_runs(runs, recipe.panorama.sphere, bar.update)
-        with progress_bar(titled(2, 'find loop closures'), total, shown=progress) as bar:
+        with progress_bar(titled(2, 'find loop closures'), total, visible=progress) as bar:
             views = views_of(runs, bar.update)
         closures = find_closures(views, recipe.panorama.clockwise)
         runs = same_scale(runs, closures)
@@ -107,12 +107,12 @@ class TrainingInput:
 
     def say(self, step: int, text: str) -> None:
         """Announce a step that has no bar."""
-        announce(titled(step, text), shown=self.progress)
+        announce(titled(step, text), visible=self.progress)
 
     def bar(self, step: int, text: str) -> Any:
         """A progress bar for a step through all images."""
         images = sum(len(run.panoramas) for run in self.runs)
-        return progress_bar(titled(step, text), images, shown=self.progress)
+        return progress_bar(titled(step, text), images, visible=self.progress)
 
 
 def train_hierarchy(given: TrainingInput, checkpoint: Checkpoint) -> Network:
@@ -122,7 +122,7 @@ def train_hierarchy(given: TrainingInput, checkpoint: Checkpoint) -> Network:
     passes, done = 2 * len(architecture.layers), start.stages if start else 0
     title = titled(3, f'learn slow features in {passes} passes')
     images = sum(len(sequence.panoramas) for sequence in sequences)
-    with progress_bar(title, images * passes, initial=images * done, shown=given.progress) as bar:
+    with progress_bar(title, images * passes, initial=images * done, visible=given.progress) as bar:
         if given.recipe.network.engine == 'mdp':
             return mdp_engine.train_network(architecture, sequences, seed, on_shard=bar.update)
         return train_network(

@@ -100,7 +100,7 @@ def tune_by_likelihood(drives: Sequence[TuningDrive], config: FilterConfig) -> F
 
     simplex = np.vstack([start, start + _FIRST_STEP * np.eye(len(TUNED))])
     options = {'maxfev': TRIALS, 'initial_simplex': simplex, 'xatol': 0.05, 'fatol': 1e-3}
-    with progress_bar('tune by likelihood', TRIALS, 'trials', shown=True) as bar:
+    with progress_bar('tune by likelihood', TRIALS, 'trials', visible=True) as bar:
         best = minimize(cost, start, method='Nelder-Mead', options=options)
     if not math.isfinite(best.fun):
         raise DataError('the filter fused nothing: give longer drives, of one clock')
@@ -111,7 +111,7 @@ def tune_by_grid(drives: Sequence[TuningDrive], config: FilterConfig) -> FilterC
     """The pair of FACTORS with the least mean error (paper)."""
     pairs = list(itertools.product(FACTORS, FACTORS))
     trials = [replace(config, measurement_factor=a, odometry_factor=b) for a, b in pairs]
-    tried = progress_over(trials, 'tune by grid', len(trials), 'trials', shown=True)
+    tried = progress_over(trials, 'tune by grid', len(trials), 'trials', visible=True)
     return min(tried, key=lambda trial: error_cost(drives, trial))
 
 

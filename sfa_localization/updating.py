@@ -129,7 +129,7 @@ def new_views(
     # Weakly recognized images are those to learn; the smoother decides if their poses are certain.
     smoother = filter_of(model, replace(config, degraded_std=config.lost_std), Smoother)
     images = Observer(model, watch).observe_run(run)
-    images = progress_over(images, f'replay {run.name}', len(run.panoramas), shown=progress)
+    images = progress_over(images, f'replay {run.name}', len(run.panoramas), visible=progress)
     observations, localised = list[Observation](), list[bool]()
     for _, observation, _ in replay(smoother, run.odometry, run.panoramas.stamps_ns, images):
         if observation is not None:

@@ -74,19 +74,15 @@ def drive(path):
         ]
 
 
-COUNTS = {
-    '/image_raw': IMAGES,
-    '/ground_truth': IMAGES,
-    '/imu': IMAGES * PER_IMAGE,
-    '/odom': IMAGES * PER_IMAGE + 1,
-}
+COUNTS = {'/image_raw': IMAGES, '/ground_truth': IMAGES, '/imu': IMAGES * PER_IMAGE,
+          '/odom': IMAGES * PER_IMAGE + 1}  # fmt: skip
 
 
 def write_pictures(path, pictures, later=0):
     """Record pictures with odometry, which lags behind by so many of them."""
     with BagWriter(path) as bag:
-        for index, shown in enumerate(pictures):
-            bag.image('/image', stamp(index), shown, 'camera')
+        for index, picture in enumerate(pictures):
+            bag.image('/image', stamp(index), picture, 'camera')
             bag.odometry('/odom', stamp(index + later), pose(index), (1, 0), (0, 0))
     return path
 
@@ -130,9 +126,9 @@ def write_database(path, messages, *, schema=2, kind=str, serialization='cdr', q
     for topic, name in kinds(messages).items():
         row = [ids[topic], topic, kind(name), serialization] + ([qos] if schema >= 2 else [])
         database.execute(f'INSERT INTO topics VALUES ({",".join("?" * len(row))})', row)
-    for message in messages:
-        row = (ids[message.topic], message.receive_ns, message.data)
-        database.execute('INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)', row)
+    rows = [(ids[m.topic], m.receive_ns, m.data) for m in messages]
+    insert = 'INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)'
+    database.executemany(insert, rows)
     database.commit()
     database.close()
     return path
@@ -179,16 +175,14 @@ def write_version(path, messages, version):
 def write_mcap(path, messages, *, compression='', index=True, chunk_size=4000):
     """Write an .mcap in chunks, or without (`compression` None), with an index or without."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    names = ('repeat_channels', 'repeat_schemas', 'use_statistics', 'use_summary_offsets')
     writer = McapWriter(
         str(path),
-        chunk_size=chunk_size,
-        compression=CompressionType[(compression or 'none').upper()],
+        chunk_size,
+        CompressionType[(compression or 'none').upper()],
         index_types=IndexType.ALL if index else IndexType.NONE,
-        repeat_channels=index,
-        repeat_schemas=index,
         use_chunking=compression is not None,
-        use_statistics=index,
-        use_summary_offsets=index,
+        **dict.fromkeys(names, index),
     )
     writer.start('ros2', 'test')
     channels = {}
@@ -230,11 +224,9 @@ def write_split(path, messages):
     """Write a bag in twelve files, so that names in order are not files in order."""
     size = -(-len(messages) // 12)
     parts = [messages[start : start + size] for start in range(0, len(messages), size)]
-    files = [
-        write_mcap(path / f'bag_{index}.mcap', part, compression='zstd')
-        for index, part in enumerate(parts)
-    ]
-    names = [file.name for file in files]
+    names = [f'bag_{index}.mcap' for index in range(len(parts))]
+    for name, part in zip(names, parts, strict=True):
+        write_mcap(path / name, part, compression='zstd')
     (path / 'metadata.yaml').write_text(metadata(5, names, messages, storage='mcap'))
     return path
 
@@ -286,6 +278,6 @@ FORMATS = {
     'lone mcap, no index': lambda p, m: write_mcap(p / 'lone.mcap', m, index=False),
     'lone mcap, neither': lambda p, m: write_mcap(p / 'a.mcap', m, compression=None, index=False),
     'ROS 1': lambda p, m: write_ros1(p / 'lone.bag', m),
-    'ROS 1 bz2': lambda p, m: write_ros1(p / 'lone.bag', m, 'bz2'),
+    'ROS 1 bz2': lambda p, m: write_ros1(p / 'lone.bag', m, 'bz2', chunk_size=2000),
     'ROS 1 lz4': lambda p, m: write_ros1(p / 'lone.bag', m, 'lz4'),
 }

@@ -24,11 +24,11 @@ def desk_mirror(count, turns='mirror'):
     still, rng = cv2.imread(str(FOLDER / 'desk_mirror.jpg')), np.random.default_rng(0)
     rows, columns = np.mgrid[: still.shape[0], : still.shape[1]]
     radius = np.hypot(columns - DESK_CENTER[0], rows - DESK_CENTER[1])
-    shown = (radius > DESK_RADII[0]) & (radius < DESK_RADII[1]) | (turns == 'picture')
+    mirror = (radius > DESK_RADII[0]) & (radius < DESK_RADII[1]) | (turns == 'picture')
     for index in range(count):
         turn = cv2.getRotationMatrix2D(DESK_CENTER, index * STEP_DEG, 1.0)
         turned = cv2.warpAffine(still, turn, still.shape[1::-1])
-        picture = np.where(shown[..., None], turned, still)
+        picture = np.where(mirror[..., None], turned, still)
         yield np.clip(picture + rng.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
 
 

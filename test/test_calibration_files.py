@@ -20,24 +20,15 @@ from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.settings import CameraConfig, LensCalibration
 from sfa_localization.data.errors import CameraError, ConfigError
 
-OCAM = """#polynomial coefficients of the direct mapping
-
-4 -2.0e+02 0.0e+00 1.5e-03 -2.0e-06
-
-#polynomial coefficients of the inverse mapping
-
-3 300.0 150.0 -10.0
-
-#center: "row" and "column", starting from 0
-
-241.5 318.5
-
-#affine parameters "c", "d", "e"
-
-0.999 0.001 -0.002
-
-#image size: "height" and "width"
-
+OCAM = """#polynomial coefficients of the direct mapping\n
+4 -2.0e+02 0.0e+00 1.5e-03 -2.0e-06\n
+#polynomial coefficients of the inverse mapping\n
+3 300.0 150.0 -10.0\n
+#center: "row" and "column", starting from 0\n
+241.5 318.5\n
+#affine parameters "c", "d", "e"\n
+0.999 0.001 -0.002\n
+#image size: "height" and "width"\n
 480 640
 """
 MATRIX = [285.5, 0.0, 424.0, 0.0, 286.5, 400.0, 0.0, 0.0, 1.0]
@@ -118,7 +109,7 @@ def read(tmp_path, text, name='camera.yaml'):
     return read_calibration(path)
 
 
-def test_one_camera_from_the_files_of_every_program(tmp_path):
+def test_files_of_every_program_give_the_same_camera(tmp_path):
     """Focal lengths, center, size and four coefficients are the same in all."""
     xi, four = np.array([[1.25]]), [*LENS.values()]
     for text, model, mirror in (

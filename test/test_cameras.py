@@ -12,7 +12,7 @@ from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError, ConfigError
 
-FORWARD, LEFT, UP = np.eye(3)
+FORWARD, LEFTWARD, UP = np.eye(3)
 OPEN = {'radius_min': 0.0, 'radius_max': 0.0}
 PINHOLE = {'xi': 0.0, 'axis': 'forward', 'mirrored': 'no', **OPEN}
 OCAM = (-157.9, 0.0, 1.83e-3, -1.1e-6, 3.2e-9)
@@ -81,7 +81,7 @@ def test_the_mirror_model_by_hand():
     """xi = 0.9, horizontal ray: z = 0, so the radius is f / xi; straight down: the center."""
     camera = make_camera(LensCalibration(radius_min=0.0), SIZE)
     expected = [[319.5, 319.5 - 150 / 0.9], [319.5 + 150 / 0.9, 319.5], [319.5, 319.5]]
-    np.testing.assert_allclose(camera.project(np.array([FORWARD, LEFT, -UP])), expected)
+    np.testing.assert_allclose(camera.project(np.array([FORWARD, LEFTWARD, -UP])), expected)
     angle = np.array([0.2, 0.9, 1.5, 2.0])  # a paraboloid maps it to the radius tan(angle / 2)
     pixels = lens_of(xi=1.0, fx=100.0, fy=100.0).project(unit(*angle))
     np.testing.assert_allclose(pixels[:, 0], 100 * np.tan(angle / 2))
@@ -144,9 +144,9 @@ def test_where_the_picture_looks():
     quarter = 100 * np.pi / 2
     pixels = np.array([[319.5 + quarter, 319.5], [319.5, 319.5 - quarter], [319.5, 319.5]])
     for axis, mirrored, right, top, center in (
-        ('down', 'no', -LEFT, FORWARD, -UP), ('down', 'yes', LEFT, FORWARD, -UP),
-        ('up', 'no', LEFT, FORWARD, UP), ('up', 'yes', -LEFT, FORWARD, UP),
-        ('forward', 'no', -LEFT, UP, FORWARD),
+        ('down', 'no', -LEFTWARD, FORWARD, -UP), ('down', 'yes', LEFTWARD, FORWARD, -UP),
+        ('up', 'no', LEFTWARD, FORWARD, UP), ('up', 'yes', -LEFTWARD, FORWARD, UP),
+        ('forward', 'no', -LEFTWARD, UP, FORWARD),
     ):  # fmt: skip
         settings = {'axis': axis, 'mirrored': mirrored, 'fx': 100.0, 'fy': 100.0}
         camera = make_camera(LensCalibration(camera_model='fisheye', **settings, **OPEN), SIZE)
@@ -158,9 +158,9 @@ def test_roll_comes_first_then_pitch_then_yaw():
     lens = LensCalibration(camera_model='equirectangular')
     center, right = (199.5, 99.5), (299.5, 99.5)
     for mount, pixel, ray in (
-        ((0.0, 0.0, 90.0), center, LEFT), ((0.0, 90.0, 0.0), center, -UP),
+        ((0.0, 0.0, 90.0), center, LEFTWARD), ((0.0, 90.0, 0.0), center, -UP),
         ((90.0, 0.0, 0.0), center, FORWARD), ((90.0, 0.0, 0.0), right, -UP),
-        ((90.0, 90.0, 0.0), right, -FORWARD), ((90.0, 90.0, 90.0), right, -LEFT),
+        ((90.0, 90.0, 0.0), right, -FORWARD), ((90.0, 90.0, 90.0), right, -LEFTWARD),
     ):  # fmt: skip
         camera = make_camera(lens, (200, 400), mount_rpy=mount)
         np.testing.assert_allclose(camera.unproject(np.array([pixel])), [ray], atol=1e-12)
@@ -169,8 +169,8 @@ def test_roll_comes_first_then_pitch_then_yaw():
 
 
 def test_intrinsics_follow_the_size_of_the_picture():
-    large, small = (make_camera(LensCalibration(), size).project(rays()) for size in
-                    (SIZE, (320, 320)))  # fmt: skip
+    large, small = (make_camera(LensCalibration(), size).project(rays())
+                    for size in (SIZE, (320, 320)))  # fmt: skip
     both = np.isfinite(large[:, 0]) & np.isfinite(small[:, 0])
     np.testing.assert_allclose((small[both] + 0.5) * 2 - 0.5, large[both], atol=1e-9)
 

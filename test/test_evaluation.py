@@ -49,7 +49,7 @@ def test_evaluate_judges_pictures_by_the_section_of_sfa_node(bag, tmp_path, caps
     assert plain == {
         'used': 119 - 1 - 2 - 1 - 3 - 6 - 4,
         'skipped': {
-            'image is unlike any of training': 4,
+            'image is unlike all training images': 4,
             'image is dark': 2,
             'image is covered: it shows nothing': 1,
             'image repeats the one before': 3,
@@ -59,7 +59,7 @@ def test_evaluate_judges_pictures_by_the_section_of_sfa_node(bag, tmp_path, caps
     assert '; 2 skipped: image is dark' in capsys.readouterr().out
     watch = {'least_explained': 0.4}
     skipped = evaluated(bag, tmp_path, sfa_node=watch)['counts']['observations']['skipped']
-    assert skipped['image is unlike any of training'] == 4 + 3
+    assert skipped['image is unlike all training images'] == 4 + 3
 
 
 @pytest.mark.parametrize('command', ['evaluate', 'tune'])

@@ -95,10 +95,10 @@ def test_what_is_no_regular_file_is_not_replaced_and_named(tmp_path):
     assert stat.S_ISCHR(Path('/dev/null').stat().st_mode)
 
 
-def test_whoever_writes_files_does_so_through_the_one_writer():
+def test_files_are_written_by_atomic_write_alone():
     writers = {'write_text', 'write_bytes', 'imwrite', 'tofile', 'savetxt', 'mkstemp', 'mkdtemp',
                'rename', 'NamedTemporaryFile', 'truncate', 'fdopen'}  # fmt: skip
-    found = set()
+    modules = set()
     package = Path(sfa_localization.__file__).parent
     for path in package.rglob('*.py'):
         for call in ast.walk(ast.parse(path.read_text('utf-8'))):
@@ -108,16 +108,13 @@ def test_whoever_writes_files_does_so_through_the_one_writer():
             modes = [a.value for a in call.args if isinstance(a, ast.Constant)]
             opens = name == 'open' and any(m in ('w', 'wb', 'x', 'xb', 'a', 'ab') for m in modes)
             if name in writers or opens:
-                found.add(path.relative_to(package).with_suffix('').as_posix())
-    assert found == set(OTHERS)
-
-
-# Bags are folders.
+                modules.add(path.relative_to(package).with_suffix('').as_posix())
+    assert modules == set(OTHERS)
 
 
 @pytest.mark.parametrize('storage', bag_writer.STORAGES)
 @pytest.mark.parametrize('error', [FULL, KeyboardInterrupt(), RuntimeError('database is full')])
-def test_no_part_of_a_bag_is_left(tmp_path, monkeypatch, storage, error):
+def test_no_part_of_a_bag_remains(tmp_path, monkeypatch, storage, error):
     """And the error inside is not hidden by that of closing."""
 
     def fail(*_args, **_named):
@@ -230,7 +227,7 @@ def test_an_output_replaces_an_empty_file_and_what_the_command_wrote(tmp_path, m
     assert 'a.yaml: is no file of calibrate: give another name' in capsys.readouterr().err
 
 
-def test_a_report_replaces_its_own_files_only(tmp_path, capsys):
+def test_a_report_replaces_only_files_of_reports(tmp_path, capsys):
     words = ['inspect', str(BAGS / 'sample'), '--report']
     for name in ('index.html', 'report.md', 'sample_path.png'):
         folder = tmp_path / name
@@ -252,9 +249,6 @@ def test_a_report_replaces_its_own_files_only(tmp_path, capsys):
 
 def interrupt(*_):
     raise KeyboardInterrupt
-
-
-# The folder of the demo.
 
 
 def test_a_folder_of_anything_else_is_not_changed(tmp_path):

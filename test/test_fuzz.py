@@ -28,7 +28,7 @@ from sfa_localization.data.errors import LocalizationError
 from sfa_localization.inspection import inspect
 from sfa_localization.place_model import PlaceModel
 
-INPUTS = int(os.environ.get('FUZZ_INPUTS', '100'))
+INPUTS = int(os.environ.get('FUZZ_INPUTS', '60'))
 Random = np.random.Generator
 
 

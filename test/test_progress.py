@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 def test_a_log_gets_a_line_each_ten_seconds(monkeypatch, capsys):
     now = [0.0]
     monkeypatch.setattr('tqdm.std.time', lambda: now[0])
-    with progress.progress_bar('read', 100, shown=True) as bar:
+    with progress.progress_bar('read', 100, visible=True) as bar:
         for _ in range(50):
             now[0] += 0.5
             bar.update()
@@ -26,10 +26,10 @@ def test_a_log_gets_a_line_each_ten_seconds(monkeypatch, capsys):
         'read: 20% of 100 images, 40 s left',
         'read: 40% of 100 images, 30 s left',
     ]
-    for _ in progress.progress_over(range(3), 'read', shown=True):
+    for _ in progress.progress_over(range(3), 'read', visible=True):
         now[0] += 11.0
     assert capsys.readouterr().err.splitlines()[0] == 'read: 1 images'
-    assert list(progress.progress_over(range(5), 'read', 5, shown=True)) == [0, 1, 2, 3, 4]
+    assert list(progress.progress_over(range(5), 'read', 5, visible=True)) == [0, 1, 2, 3, 4]
     assert capsys.readouterr() == ('', ''), 'short work leaves nothing'
 
 
@@ -41,7 +41,7 @@ class Terminal(io.StringIO):
 def test_a_terminal_gets_a_bar(monkeypatch):
     screen = Terminal()
     monkeypatch.setattr(sys, 'stderr', screen)
-    assert list(progress.progress_over(range(4), 'read', 4, shown=True)) == [0, 1, 2, 3]
+    assert list(progress.progress_over(range(4), 'read', 4, visible=True)) == [0, 1, 2, 3]
     assert '\r' in screen.getvalue() and 'read: 100%' in screen.getvalue()
 
 

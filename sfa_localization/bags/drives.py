@@ -229,7 +229,7 @@ def _read(
     uses = {id(stream): use for use, stream in streams.items()}
     values: dict[str, StampedValues] = {use: [] for use in streams}
     total = bag.topics[streams['images'].topic].count
-    with progress_bar(f'read {bag.path.name}', total, shown=progress) as bar:
+    with progress_bar(f'read {bag.path.name}', total, visible=progress) as bar:
         for stream, stamp_ns, value in bag.read(streams.values()):
             if stream is streams['images']:
                 stored.add(stamp_ns, value)

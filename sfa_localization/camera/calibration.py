@@ -77,8 +77,8 @@ def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
     """Find the rim of the mirror, and its hole, in images (H, W, 3) of one size.
 
     Just outside of the rim the image is dark or, in several images taken while driving, does not
-    change; the cue that shows the circle more clearly counts. So does the image just inside of the
-    hole. Raises CameraError when no circle stands out.
+    change; the cue with the clearer circle counts. The same holds just inside of the hole. Raises
+    CameraError when no circle stands out.
     """
     rng = np.random.default_rng(seed)
     scale = min(_SEARCHED_PX / max(images[0].shape), 1.0)
@@ -263,9 +263,8 @@ def calibrate(
 ) -> LensCalibration:
     """The lens from a calibration file, or from the circle in images (H, W, 3).
 
-    `given` holds fields of LensCalibration that take precedence; its circle replaces that of the
-    images, and its radii limit what is visible of a lens from a file. Raises CameraError when this
-    is not enough.
+    `given` holds fields of LensCalibration that take precedence; a circle in it replaces that of
+    the images, and radii in it limit the visible part of a lens from a file. Raises CameraError.
     """
     if calibration_file is not None:
         used = {name: value for name, value in given.items() if name not in _CIRCLE[:2]}
@@ -343,25 +342,21 @@ def _resized(image: Any, width: int) -> Any:
 
 def _draw(canvas: Image, rays: Array) -> None:
     """Draw directions and elevations into an image whose pixels see the rays (H, W, 3)."""
-    x, y, z = np.moveaxis(rays, -1, 0)
-    elevations = {k: f'{k:+d} deg' if k else 'HORIZON' for k in range(-80, 90, 10)}
-    for elevation in elevations:
-        border = _border(z > np.sin(np.radians(elevation)), x, 2 if elevation else 3)
-        canvas[border] = _GREEN
-    for half in (x > 0, y > 0):
-        canvas[_border(half, x)] = _RED
-    for elevation, name in elevations.items():
+    x, y, z = np.moveaxis(np.nan_to_num(rays), -1, 0)
+    square = np.ones((3, 3), np.uint8)
+    visible = cv2.erode(np.isfinite(rays[..., 0]).astype(np.uint8), square) > 0
+    bands, quadrants = (
+        np.floor(np.degrees(np.arcsin(np.clip(z, -1, 1))) / 10),
+        2 * (x > 0) + (y > 0),
+    )
+    for regions, color in ((bands, _GREEN), (quadrants, _RED)):
+        border = cv2.morphologyEx(regions.astype(np.int16), cv2.MORPH_GRADIENT, square[:2, :2])
+        canvas[(border > 0) & visible] = color
+    for elevation in range(-80, 90, 10):
+        name = f'{elevation:+d} deg' if elevation else 'HORIZON'
         _write(canvas, name, rays, (_LABELS_DEG, elevation), _GREEN)
     for name, azimuth in _SIDES.items():
         _write(canvas, name, rays, (azimuth, 0), _RED)
-
-
-def _border(region: Mask, visible: Array, width: int = 2) -> Mask:
-    """Mask (H, W) of the border of a region among pixels whose `visible` is no NaN."""
-    square = np.ones((width, width), np.uint8)
-    border = cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_GRADIENT, square)
-    inside = cv2.erode(np.isfinite(visible).astype(np.uint8), square)
-    return np.asarray((border > 0) & (inside > 0))
 
 
 def _write(

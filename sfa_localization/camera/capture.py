@@ -123,7 +123,7 @@ def _frames(capture: cv2.VideoCapture, at_end: str = '') -> CapturedImages:
 
 
 def _paced(images: Iterable[Image | CameraError], rate_hz: float) -> CapturedImages:
-    """The images at a rate; a reader that is late does not catch up."""
+    """Yield images at a rate; a late reader skips the lost time."""
     due = time.monotonic()
     for image in images:
         now = time.monotonic()

@@ -65,8 +65,8 @@ class CameraKind:
         if self.name not in (ORDINARY, STEREO):
             return ''
         return (
-            'the images do not show all directions: an omnidirectional camera is needed (if it is '
-            'one all the same, describe it with calibration_file)'
+            'the images do not show all directions: an omnidirectional camera is needed (if this '
+            'is one, describe it with calibration_file)'
         )
 
     def entry(self, bag: str) -> str:
@@ -94,8 +94,8 @@ def guess_geometry(samples: Sequence[Image]) -> tuple[str, str]:
         return MIRROR, f'a circle, and the camera itself in its middle, {share:.0%} as wide'
     if closes:
         kind = EQUIRECTANGULAR if twice else PANORAMA
-        return kind, f'{ratio}, the right edge goes on at the left'
-    return ORDINARY, 'no circle, and edges that do not go on at the other side'
+        return kind, f'{ratio}, whose right edge continues at the left'
+    return ORDINARY, 'no circle, and the edges do not continue at the other side'
 
 
 def require_single_view(runs: Sequence[Run]) -> None:

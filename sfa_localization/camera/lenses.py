@@ -34,8 +34,8 @@ class Curve(NamedTuple):
 
 
 def increasing(f: Callable[[Array], Array], df: Callable[[Array], Array], limit: float) -> Curve:
-    """A smooth y = f(x) with f(0) = 0 and derivative df, from 0 up to where it stops to increase,
-    at most up to `limit`. Raises CameraError where it does not increase at 0.
+    """A smooth y = f(x) with f(0) = 0 and derivative df, on the interval from 0 on which it
+    increases, at most up to `limit`. Raises CameraError where it does not increase at 0.
     """
     x = np.linspace(0.0, limit, _SAMPLES)
     falling = np.flatnonzero(df(x) <= 0.0)

@@ -51,8 +51,8 @@ class Unwrapper:
     """Turns images of one camera into panoramas; tables are built when their size changes.
 
     Invisible panorama pixels (outside the image or its radii, masked, in a blind sector) repeat the
-    nearest visible pixel of their row, or of the nearest row with any: unlike a constant color,
-    this makes no edges that turn with the robot.
+    nearest visible pixel of their row, or of the nearest row that has one. Unlike a constant color
+    this adds no edges that turn with the robot.
 
     `calibration` is the lens; by default the one that the camera describes.
     """

@@ -100,7 +100,7 @@ class CameraConfig(Settings):
     camera_model: str = setting(
         '',
         'camera without a calibration_file: mirror (that of the simulator), equirectangular, or '
-        'panorama (the image is a panorama already); empty: none, and only images that are 3.5 '
+        'panorama (the image is a panorama already); empty: none, then only images at least 3.5 '
         'times as wide as high are used, as panoramas',
         choices=('', 'mirror', *UNCALIBRATED),
     )
@@ -147,8 +147,8 @@ class WatchConfig(Settings):
 
     least_explained: float = setting(
         0.25,
-        'images of which their place explains a smaller part (1: all) are not used: of foreign '
-        'images 0.1, 0.28 at most',
+        'images are rejected if their place explains a smaller share of them (foreign images: 0.1, '
+        'at most 0.28)',
         low=0.0,
         high=1.0,
         live=True,

@@ -20,11 +20,11 @@ Texture = NDArray[np.float32]
 _COLUMNS, _ROWS = 200, 10
 _FEW_COLUMNS = 50  # of the textures that are stored
 _WIDEST = 0.2  # of the panorama: wider structures are light, not landmarks
-# The mean of this many images whose correlations are below _DIFFERENT holds what never changes: the
+# The mean of this many images with correlations below _DIFFERENT shows only constant parts: the
 # robot, a mask.
 _STATIC_MIN, _STATIC_MAX, _DIFFERENT = 8, 64, 0.95
-# Textures without that mean count where their peak exceeds this many standard deviations. With a
-# robot that hardly turns, the mean holds the surroundings, and the rest is noise: it peaks at 3.
+# Textures without that mean count where their peak exceeds this many standard deviations. If the
+# robot hardly turns, the mean contains the surroundings, and the rest is noise with a peak of 3.
 _PROMINENT = 3.2
 _CONTRAST = np.float32(1.0)  # logarithmic; more, as at the edge of a mask, is clipped
 

@@ -22,8 +22,8 @@ FROZEN_IMAGES = 5
 FROZEN_S = 5.0
 """Seconds of equal images after which a camera is reopened."""
 EXPLAINED_WARNING = 0.4
-"""An image of which its place explains less is used with a warning; of half-covered images it is
-0.15 to 0.5."""
+"""Below this explained share an image is used with a warning; half-covered images have 0.15 to
+0.5."""
 _STRIDE = 3  # every third pixel along each axis is compared
 
 
@@ -76,6 +76,6 @@ class ImageWatch:
         return 0 < self._frozen.repeats < FROZEN_IMAGES - 1
 
     def judge_place(self, explained: float) -> str:
-        """Why an image cannot be used of which its place explains this part; '' when it can."""
+        """Why an image with this explained share cannot be used; '' if it can."""
         familiar = explained >= self.config.least_explained
-        return '' if familiar else 'image is unlike any of training'
+        return '' if familiar else 'image is unlike all training images'

@@ -19,7 +19,7 @@ _NEW_FILE_MODE = 0o644
 
 
 def absence(path: Path | str) -> str:
-    """Why there is no regular file: nothing is there, or a folder, or what may never end."""
+    """Why a path is no regular file: it is missing, a folder, or a pipe or device."""
     if os.path.isdir(path):
         return 'is a folder'
     return 'is no regular file' if os.path.exists(path) else 'no such file'

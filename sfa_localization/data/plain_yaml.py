@@ -40,7 +40,7 @@ def load_yaml(text: str, loader: Any = YamlLoader, *, first: bool = False) -> An
 
 def _check_events(text: str, first: bool) -> None:
     """Check depth and keys before anything is made: libyaml's composer overflows the stack."""
-    levels: list[list[Any]] = []  # of each open one: the keys if a mapping, number of nodes
+    levels: list[list[Any]] = []  # of each open collection: its keys and number of nodes
     for event in yaml.parse(text, YamlLoader):
         if isinstance(event, yaml.DocumentEndEvent) and first:
             return

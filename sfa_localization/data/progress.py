@@ -39,20 +39,20 @@ def _bar(items: Iterable[T] | None, desc: str, total: int | None, unit: str, **o
 
 
 def progress_bar(
-    desc: str, total: int | None = None, unit: str = 'images', initial: int = 0, *, shown: bool
+    desc: str, total: int | None = None, unit: str = 'images', initial: int = 0, *, visible: bool
 ) -> Any:
-    """A context manager with `update(n)`, `n` and `total`; not `shown`, it counts silently."""
-    return _bar(None, desc, total, unit, initial=initial, disable=not shown)
+    """A context manager with `update(n)`, `n` and `total`; if not `visible`, it counts silently."""
+    return _bar(None, desc, total, unit, initial=initial, disable=not visible)
 
 
 def progress_over(
-    items: Iterable[T], desc: str, total: int | None = None, unit: str = 'images', *, shown: bool
+    items: Iterable[T], desc: str, total: int | None = None, unit: str = 'images', *, visible: bool
 ) -> Iterator[T]:
     """The items, with the progress through them."""
-    return iter(_bar(items, desc, total, unit, disable=not shown))
+    return iter(_bar(items, desc, total, unit, disable=not visible))
 
 
-def announce(text: str, *, shown: bool) -> None:
+def announce(text: str, *, visible: bool) -> None:
     """Say what begins, in a line of its own."""
-    if shown:
+    if visible:
         sys.stderr.write(f'{text}\n')

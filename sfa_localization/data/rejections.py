@@ -14,7 +14,7 @@ OTHER = 'other reasons'
 
 
 class RejectionCounter(Counter[str]):
-    """Counts by reason of at most LONGEST characters; those after the first MOST are summed."""
+    """Counts by reason, cut to LONGEST characters; reasons after the first MOST share one count."""
 
     def add(self, reason: str, number: int = 1) -> int:
         """Count a reason `number` times; returns its count, or that of OTHER where it is summed."""

@@ -89,9 +89,9 @@ class Rig:
 
             base = camera - exp(i yaw) lever
 
-        as the mean over the wrapped normal distribution of the yaw. An error of the lever arm has
-        also moved the labels of training, by the mean `facing` of exp(i yaw) of the keyframes
-        matched: at the heading of training it cancels.
+        as the mean over the wrapped normal distribution of the yaw. An error of the lever arm
+        also displaced the labels of training, by the mean `facing` of exp(i yaw) of the matched
+        keyframes: at the heading of training it cancels.
         """
         lever, turn = self.lever, float(pose[2] - self.camera_yaw.value)
         variance = float(covariance[2, 2]) + self.camera_yaw.std**2

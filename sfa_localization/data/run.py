@@ -61,7 +61,7 @@ class Trajectory:
 def _along(start: Array, end: Array, t: Array) -> Array:
     """Poses at a fraction t (M,) of the arc from start to end, both (M, 3).
 
-    The chord of an arc that turns by a points along a / 2, and is sinc(a / 2 pi) times the arc.
+    The chord of an arc of turn a has the bearing a / 2, and sin(a / 2) / (a / 2) of its length.
     """
     step = relative(start, end)
     half = step[:, 2] / 2
@@ -77,8 +77,8 @@ class Odometry:
     """Wheel odometry: poses in the odom frame and the twist that moved them.
 
     `stamps_ns` (N,), `poses` (N, 3), `twists` (N, 2) as v m/s, omega rad/s; `variances` (N, 2) of
-    v and omega as in the messages, 0 where unknown. A twist is the mean over the time since the
-    previous message, as drivers of wheel encoders publish it; the first is not used. `part` (N,)
+    v and omega as in the messages, 0 where unknown. A twist is the mean since the previous
+    message, as drivers of wheel encoders publish it; the first twist is not used. `part` (N,)
     numbers the unbroken parts, by default a single one: the motion between two parts is unknown.
     """
 
@@ -91,12 +91,6 @@ class Odometry:
     def __post_init__(self) -> None:
         if len(self.part) == 0:
             object.__setattr__(self, 'part', np.zeros(len(self.stamps_ns), np.int64))
-
-    @classmethod
-    def along(cls, path: Trajectory) -> Odometry:
-        """Exact odometry of a path, of unknown variances: mean twists from pose to pose."""
-        twists = differences(path.stamps_ns, path.poses)
-        return cls(path.stamps_ns, path.poses, twists, np.zeros_like(twists))
 
     @property
     def trajectory(self) -> Trajectory:

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages to and from plain values; a malformed message raises MessageError with the reason.
+"""ROS messages to and from plain values; malformed ones raise MessageError, images CameraError.
 
 Messages are filled here and nowhere else; `data.messages` reads their fields. Stamps are integer
 nanoseconds, poses are (x m, y m, yaw rad), covariances of poses are (3, 3) in that order.

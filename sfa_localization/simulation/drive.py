@@ -279,7 +279,7 @@ def record(
     with BagWriter(out, config.storage) as bag:
         noisy = render_images(garden, driven, config, view)
         count = len(driven.image_stamps_ns)
-        shown = progress_over(noisy, f'render the images of {out.name}', count, shown=progress)
+        shown = progress_over(noisy, f'render the images of {out.name}', count, visible=progress)
         _write(bag, driven, shown, config)
 
 

@@ -10,7 +10,7 @@ from robustness.judged import output
 from robustness.messages import Picture, Reading, Restart
 from robustness.recorded import model, to_truth
 from sfa_localization.camera.encodings import read_compressed
-from sfa_localization.data.errors import MessageError, ModelError
+from sfa_localization.data.errors import CameraError, ModelError
 from sfa_localization.localizer import Localizer, Observation, Observer
 
 
@@ -43,7 +43,7 @@ class Robot:
             if picture.jpeg is not None:
                 image = read_compressed(SimpleNamespace(data=picture.jpeg, format='jpeg'))
             seen = self.localizer.observer.observe(message.stamp_ns, image)
-        except (MessageError, ModelError):
+        except (CameraError, ModelError):
             return
         self.fuse(message, seen)
 

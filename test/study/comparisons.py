@@ -15,7 +15,7 @@ from unittest.mock import patch
 import numpy as np
 
 from sfa_localization.data.errors import LocalizationError
-from sfa_localization.data.run import Odometry, Run
+from sfa_localization.data.run import Odometry, Run, differences
 from sfa_localization.evaluation import evaluate
 from sfa_localization.keyframes.light import Conditions
 from sfa_localization.keyframes.location import Location
@@ -220,7 +220,10 @@ def ablations(site: Site, results: Results, world: str) -> None:
 def _exact(run: Run) -> Run:
     """A drive with exact odometry."""
     assert run.ground_truth is not None
-    return replace(run, odometry=Odometry.along(run.ground_truth), yaw_rate=None)
+    stamps_ns, poses = run.ground_truth.stamps_ns, run.ground_truth.poses
+    twists = differences(stamps_ns, poses)
+    odometry = Odometry(stamps_ns, poses, twists, np.zeros_like(twists))
+    return replace(run, odometry=odometry, yaw_rate=None)
 
 
 def _first_pass(
