@@ -261,7 +261,7 @@ def launch(launch_file):
     return start
 
 
-def test_launch_file_starts_all_nodes_with_known_parameters_and_topics(launch):
+def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
     """The transform stays in the namespace unless asked; nodes can be left out."""
     launched, without = launch(model='model.npz'), launch(panorama='/panorama')
     assert [*launched] == list(NODES) and [*without] == ['sfa_node', 'ekf_node']

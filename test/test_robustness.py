@@ -177,11 +177,11 @@ def test_a_replay_gives_the_same_messages_and_any_pace_the_same_estimate(bench):
 def shuffled(drive):
     """By tens: all pictures first, or all odometry first, in turns; the start stays the start."""
     events = drive.events()
-    found = events[:10]
+    order = events[:10]
     for at in range(10, len(events), 10):
         sign = 1 if at % 20 else -1
-        found += sorted(events[at : at + 10], key=lambda e, s=sign: (s * e[1], e[0]))
-    return found
+        order += sorted(events[at : at + 10], key=lambda e, s=sign: (s * e[1], e[0]))
+    return order
 
 
 # Overload.
