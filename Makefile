@@ -34,9 +34,10 @@ study: $(READY)  ## one of these studies, a year, or half-real bags (ARGS='basel
 test: $(READY)  ## run all tests, several files at once (ARGS='-k bag' for some of them)
 	$(PY) -m pytest $(PARALLEL) $(ARGS)
 
-robustness: $(READY)  ## run the tests of faults, write their table, print what each fault of a drive did (20 minutes)
+robustness: $(READY)  ## run the tests of faults, write their tables, replay a drive with each fault (25 minutes)
 	PYTHONPATH=.:test $(PY) -m robustness --page
 	$(PY) -m pytest -m robustness $(ARGS)
+	PYTHONPATH=.:test $(PY) -m robustness --frozen
 	PYTHONPATH=.:test $(PY) -m robustness --live --lights
 
 animation: $(READY)  ## film the three nodes while the robot is kidnapped: resource/kidnapped.webp

@@ -172,7 +172,7 @@ def test_robot_needs_no_training_code():
     assert {m: bad for m in modules if (bad := external(m) & NOT_ON_THE_ROBOT)} == {}
 
 
-def test_one_version():
+def test_versions_agree():
     manifest = ET.parse(ROOT / 'package.xml').getroot()
     assert (manifest.get('format'), manifest.findtext('export/build_type')) == ('3', 'ament_python')
     assert manifest.findtext('version') == setup_arguments()['version']
@@ -194,7 +194,7 @@ def setup_arguments(command: str = 'bdist_wheel') -> dict:
     return arguments
 
 
-def test_pip_installs_one_command_and_the_nodes_and_colcon_every_command_for_ros2_run():
+def test_pip_installs_a_command_and_the_nodes_and_colcon_all_commands():
     for command in ('bdist_wheel', 'editable_wheel', 'dist_info', 'install', 'develop'):
         arguments = setup_arguments(command)
         lines = arguments['entry_points']['console_scripts']
@@ -271,7 +271,7 @@ def test_a_missing_package_is_named_with_its_remedy_if_it_is_optional(capsys):
         cli.guarded(partial(run, 'numpy'))
 
 
-def test_ctrl_c_while_a_command_is_imported_is_one_line(monkeypatch, capsys):
+def test_ctrl_c_while_a_command_is_imported_prints_a_line(monkeypatch, capsys):
     """As pybind11 does it, with a cause: ImportError('initialization failed')."""
     caused = ImportError('initialization failed')
     caused.__cause__ = KeyboardInterrupt()

@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Print what each fault of a drive did, and what the filter claimed.
+"""Print the errors of a drive with each fault, and how often the filter's claims were true.
 
 PYTHONPATH=.:test python -m robustness --live --lights 'wheels slip' kidnapped
-PYTHONPATH=.:test python -m robustness --frozen     the filter alone, also against lies: seconds
+PYTHONPATH=.:test python -m robustness --frozen     the filter alone, also against lies: minutes
 """
 
 import argparse
@@ -15,7 +15,7 @@ from page_tables import write_table
 
 from robustness import frozen, promises
 from robustness.faults import FAULTS, LIES
-from robustness.judged import head, judge, row, summary
+from robustness.judged import errors_table, head, judge, row, states_table, summary
 from robustness.recorded import OTHER_LIGHTS, two_laps
 from robustness.replay import replayed
 
@@ -33,18 +33,15 @@ def live():
     return played
 
 
-def table(title, names, outputs_of):
-    """Print a row for each fault; names of those that are not allowed, all outputs, means."""
-    wrong, outputs, means, width = [], [], {}, max(map(len, names))
+def judged(title, names, outputs_of):
+    """Print a row for each fault; return the verdicts and the outputs, by name."""
+    verdicts, outputs, width = {}, {}, max(map(len, names))
     tell(f'\nThrough {title}:\n\n{head(width)}')
     for name in names:
-        made, fault = outputs_of(name), {**FAULTS, **LIES}[name]
-        verdict = judge(made, fault.ends_s)
-        tell(row(name, verdict, width))
-        wrong += [] if name in LIES or fault.allows(verdict.false_s) else [f'{name}, {title}']
-        means[name] = verdict.mean_m
-        outputs += made
-    return wrong, outputs, means
+        outputs[name] = outputs_of(name)
+        verdicts[name] = judge(outputs[name], {**FAULTS, **LIES}[name].ends_s)
+        tell(row(name, verdicts[name], width))
+    return verdicts, outputs
 
 
 def tell(text):
@@ -73,7 +70,7 @@ def ways(options):
 
 
 def main():
-    """Run all faults, or those that are named; 1 where the filter was wrong and sure too long."""
+    """Run all faults, or those that are named; 1 if any is LOCALISED and wrong for too long."""
     parser = argparse.ArgumentParser(
         prog='robustness', description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -81,7 +78,7 @@ def main():
     for option, text in (
         ('--live', 'also through the three nodes'),
         ('--lights', 'also in other lights and seasons'),
-        ('--frozen', 'the filter alone, on what was recorded by day and in the evening'),
+        ('--frozen', 'the filter alone, by day and in the evening; writes test/README.md'),
         ('--means', 'the same; keep the mean errors, which test_faults.py lets get no worse'),
         ('--page', 'only write the faults of promises.py into test/README.md'),
         ('--record', 'locate all images anew: after training, features or keyframes change'),
@@ -94,18 +91,38 @@ def main():
     if options.record:
         frozen.record(tell)
         return 0
-    everything, wrong, means = [], [], {}
     lies = [*LIES] if options.frozen or options.means else []
-    for title, outputs_of in ways(options):
-        refused, outputs, errors = table(title, options.faults or [*FAULTS, *lies], outputs_of)
-        everything, wrong = everything + outputs, wrong + refused
-        means[title] = {name: errors[name] for name in errors if name in FAULTS}
+    results = {
+        title: judged(title, options.faults or [*FAULTS, *lies], outputs_of)
+        for title, outputs_of in ways(options)
+    }
+    means = {
+        title: {name: verdict.mean_m for name, verdict in verdicts.items() if name in FAULTS}
+        for title, (verdicts, _) in results.items()
+    }
     if options.means:
         frozen.keep(means)
-    tell(f'\n{summary(everything)}\n')
-    for name in wrong:
+    promised = [
+        output
+        for _, outputs in results.values()
+        for name in outputs
+        if name in FAULTS and 'another robot' not in name
+        for output in outputs[name]
+    ]
+    tell(f'\n{summary(promised)}\n')
+    if options.frozen and not options.faults:
+        by_day, *_ = results.values()
+        write_table('errors', errors_table(by_day[0]))
+        write_table('states', states_table(promised))
+    exceeded = [
+        f'{name}, {title}'
+        for title, (verdicts, _) in results.items()
+        for name, verdict in verdicts.items()
+        if name in FAULTS and not FAULTS[name].allows(verdict.false_s)
+    ]
+    for name in exceeded:
         sys.stderr.write(f'robustness: {name}: LOCALISED and wrong for too long\n')
-    return 1 if wrong else 0
+    return bool(exceeded)
 
 
 if __name__ == '__main__':

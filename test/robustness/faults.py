@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What goes wrong: each fault makes the messages of a drive from what happened.
+"""The faults: each makes the messages of a drive with this fault.
 
-Most last from FROM_S to UNTIL_S of the drive; the robot drives properly before and after. FAULTS
-are made of pictures and odometry; LIES, of what an image shows: they contradict nothing at first.
+Most last from FROM_S to UNTIL_S of the drive; before and after, everything works. FAULTS change
+pictures and odometry. LIES change the poses of images so that they contradict nothing at first.
 """
 
 import functools
@@ -18,13 +18,12 @@ from robustness.recorded import foreign_pictures, noisy
 
 FROM_S, UNTIL_S, NEVER = 15.0, 30.0, math.inf
 CONSISTENT_LIE_S = 2.0
-"""Seconds for which a lie that was there from the start, and contradicts nothing at first, may be
-believed."""
+"""Seconds for which a lie from the start may be believed."""
 SAME_PLACE_S = 20.0
-"""Images of another robot in the same garden contradict nothing for as long as both drive alike:
-nothing promises that they are noticed."""
+"""Images of another robot in the same garden contradict nothing while both drive alike: they need
+not be noticed."""
 NOTICED_S = 1.0
-"""A robot or camera that is moved, or held, is noticed by the next few images: one may err."""
+"""A robot or camera that is moved or held is noticed after a few images."""
 DOWN_S = 2.0
 """A node that was killed is back after so many seconds."""
 STANDING_HZ = 5
@@ -34,8 +33,8 @@ LAP = 0.5
 IMAGE_PERIOD_S = 0.25
 """By rounding, another machine may reject an image earlier or later."""
 SLIP_S, DARK_S, CARRIED_S = 8.0, 4.0, 9.0
-"""How long wheels slip, and a kidnapped robot sees nothing; it is put down where it would have been
-so much later."""
+"""How long wheels slip, and how long a kidnapped robot sees nothing; it is put down where it would
+have been CARRIED_S later."""
 
 
 @dataclass(frozen=True)
@@ -424,8 +423,8 @@ def looped(from_s, length_s):
         images = [m for m in drive.messages if isinstance(m.content, Seen)]
         at_s = np.array([(m.at_ns - drive.start_ns) / SECOND_NS for m in images])
         again_s = from_s - length_s + (at_s - from_s) % length_s
-        repeated = np.where(at_s < from_s, np.arange(len(images)), np.searchsorted(at_s, again_s))
-        contents = iter([images[i].content for i in repeated])
+        source = np.where(at_s < from_s, np.arange(len(images)), np.searchsorted(at_s, again_s))
+        contents = iter([images[i].content for i in source])
         made = changed(Seen, lambda m, *_: [m._replace(content=next(contents))], 0.0, NEVER)
         return made(drive, rng)
 

@@ -1,24 +1,27 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a drive with a fault gave: how wrong, how long wrong and sure, how soon right again."""
+"""Judge a drive with a fault: errors, seconds LOCALISED and wrong, and time to recover."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
+from page_tables import markdown
 
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.evaluation import WRONG_M
 
 WRONG_DEG = 15.0
+LARGE_M = 1.0
+"""Faults that err by more have a row in test/README.md."""
 RELIEF_S = 0.5
-"""Recovered is what stays LOCALISED and right for so long."""
+"""An estimate has recovered once it stays LOCALISED and right for this long."""
 WITHIN_95 = math.sqrt(-2 * math.log(0.05)), 1.96
-"""Standard deviations that hold 95 % of the errors: of two coordinates, and of one."""
+"""Standard deviations that contain 95 % of the errors of two coordinates, and of a single one."""
 
 
 class Output(NamedTuple):
-    """What the filter said at one odometry message: `level` by name, and the pose.
+    """The filter's output at an odometry message: the name of its `level`, and the pose.
 
     `second` of the drive, errors `error_m` and `yaw_deg`, and the standard deviations claimed.
     """
@@ -65,11 +68,11 @@ def judge(outputs, ends_s):
     """The row of a fault that ends after so many seconds of the drive."""
     if not outputs:
         return Verdict(math.nan, math.nan, 0.0, 0.0, recovery_s((), (), ends_s))
-    seconds = np.array([said.second for said in outputs])
+    seconds = np.array([each.second for each in outputs])
     lasted = np.diff(seconds, prepend=seconds[:1])
-    sure = np.array([said.level == 'LOCALISED' for said in outputs])
-    wrong = np.array([said.wrong for said in outputs])
-    errors = np.array([said.error_m for said in outputs])
+    sure = np.array([each.level == 'LOCALISED' for each in outputs])
+    wrong = np.array([each.wrong for each in outputs])
+    errors = np.array([each.error_m for each in outputs])
     times = lasted[sure & wrong].sum(), lasted[sure].sum()
     made = float(errors.max()), float(errors.mean()), *map(float, times)
     return Verdict(*made, recovery_s(seconds, sure & ~wrong, ends_s))
@@ -97,7 +100,7 @@ def head(width):
 
 def row(name, verdict, width):
     """A verdict as text."""
-    far, mean, again = (in_words(*v) for v in ((verdict.max_m, 'm'), (verdict.mean_m, 'm'),
+    far, mean, again = (with_unit(*v) for v in ((verdict.max_m, 'm'), (verdict.mean_m, 'm'),
                                             (verdict.recovered_s, 's')))  # fmt: skip
     return (
         f'{name:{width}s}  {far:>9s}  {mean:>10s}  {verdict.false_s:13.1f} s'
@@ -105,29 +108,70 @@ def row(name, verdict, width):
     )
 
 
-def in_words(value, unit):
+def with_unit(value, unit):
     """Meters or seconds in words."""
     if not math.isfinite(value):
         return '-' if math.isnan(value) else 'never'
     return f'{value:.{2 if unit == "m" else 1}f} {unit}'
 
 
-def summary(outputs):
-    """A line for each state: its seconds, its errors, and the share that its claims hold."""
-    rows = [f'{"state":10s}   share  95 % of errors below  wrong  within 95 % (position, heading)']
+def errors_table(verdicts):
+    """Return the table of the faults that do much, and a sentence on the others."""
+    small = {
+        name: verdict
+        for name, verdict in verdicts.items()
+        if not verdict.false_s and verdict.max_m <= LARGE_M
+    }
+    silent = [name for name, verdict in verdicts.items() if math.isnan(verdict.max_m)]
+    rows = [
+        [name, with_unit(verdict.max_m, 'm'), with_unit(verdict.mean_m, 'm'),
+         f'{verdict.false_s:.1f} s', f'{verdict.localised_s:.1f} s',
+         with_unit(verdict.recovered_s, 's')]
+        for name, verdict in verdicts.items() if name not in [*small, *silent]
+    ]  # fmt: skip
+    worst_m = max(verdict.max_m for verdict in small.values())
+    header = ['fault', 'max error:', 'mean error:', 'LOCALISED and wrong:', 'LOCALISED:',
+              'right again after:']  # fmt: skip
+    return markdown(header, rows) + (
+        f'\nThe other {len(small)} faults err by at most {worst_m:.2f} m, and are never LOCALISED'
+        f' and wrong. Without any estimate: {", ".join(silent) or "none"}.\n'
+    )
+
+
+def states(outputs):
+    """Return for each state its share, the 95th percentile of its errors in m, and the shares of
+    outputs that are wrong, and whose position and heading lie within 95 %.
+    """
+    rows = {}
     for level in ('LOCALISED', 'DEGRADED', 'LOST'):
-        mine = [said for said in outputs if said.level == level]
-        if not mine:
-            continue
-        error, std, yaw, yaw_std, wrong = np.transpose(
-            [
-                (said.error_m, said.std_m, said.yaw_deg, said.yaw_std_deg, said.wrong)
-                for said in mine
-            ]
-        )
-        within = np.mean(error <= WITHIN_95[0] * std), np.mean(yaw <= WITHIN_95[1] * yaw_std)
-        rows.append(
-            f'{level:10s}  {len(mine) / len(outputs):6.1%}  {np.percentile(error, 95):18.2f} m'
-            f'  {np.mean(wrong):5.1%}  {within[0]:6.1%}, {within[1]:6.1%}'
-        )
+        columns = [
+            (each.error_m, each.std_m, each.yaw_deg, each.yaw_std_deg, each.wrong)
+            for each in outputs
+            if each.level == level
+        ]
+        if columns:
+            error, std, yaw, yaw_std, wrong = np.transpose(columns)
+            within = np.mean(error <= WITHIN_95[0] * std), np.mean(yaw <= WITHIN_95[1] * yaw_std)
+            share = len(columns) / len(outputs)
+            rows[level] = share, np.percentile(error, 95), np.mean(wrong), *within
+    return rows
+
+
+def states_table(outputs):
+    """Return the states as a table."""
+    header = ['state', 'share of the time:', '95 % of errors below:', 'wrong:',
+              'position within 95 %:', 'heading within 95 %:']  # fmt: skip
+    return markdown(header, [
+        [level, f'{share:.1%}', f'{error_m:.2f} m', *(f'{part:.1%}' for part in parts)]
+        for level, (share, error_m, *parts) in states(outputs).items()
+    ])  # fmt: skip
+
+
+def summary(outputs):
+    """Return the states as text."""
+    rows = [f'{"state":10s}   share  95 % of errors below  wrong  within 95 % (position, heading)']
+    rows += [
+        f'{level:10s}  {share:6.1%}  {error_m:18.2f} m  {wrong:5.1%}  {place:6.1%}, {yaw:6.1%}'
+        for level, (share, error_m, wrong, place, yaw) in states(outputs).items()
+    ]
     return '\n'.join(rows)

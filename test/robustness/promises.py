@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the package does with each fault, and the test that shows it: a table of test/README.md.
 
-`PYTHONPATH=.:test python -m robustness --page` writes it after a change of this list.
+`PYTHONPATH=.:test python -m robustness --page` writes it after changes of this list.
 """
 
 from page_tables import markdown
