@@ -82,7 +82,7 @@ def read_drive(
 
 
 def tune_by_likelihood(drives: Sequence[TuningDrive], config: FilterConfig) -> FilterConfig:
-    """The setting under which the innovations are likeliest.
+    """The setting that maximizes the likelihood of the innovations.
 
     Nelder-Mead over the logarithms of TUNED: the cost is not smooth where the gate decides.
     """

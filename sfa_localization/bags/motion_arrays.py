@@ -49,7 +49,7 @@ def to_points(values: StampedValues) -> Points:
 
 
 def to_odometry(values: StampedValues) -> tuple[Odometry, str]:
-    """Odometry, and an oddity of it in words, or ''.
+    """Odometry, and a sentence on a peculiarity of it, or ''.
 
     The values are a pose with v, omega and their variances, or with None where messages have only
     poses: then twists are the differences of poses.

@@ -35,7 +35,9 @@ class Item(NamedTuple):
         return abs(self.late_ns(before)) <= CLOCK_JUMP_NS
 
     def corrects(self, ahead: Item, before: Item | None) -> bool:
-        """Whether its stamp is likelier than the later stamp of the previous message `ahead`."""
+        """Whether this stamp is more plausible than the later stamp of the previous message,
+        `ahead`.
+        """
         if before is None or self.stamp_ns == ahead.stamp_ns:
             return self.stamp_ns < ahead.stamp_ns
         later = self.stamp_ns > before.stamp_ns

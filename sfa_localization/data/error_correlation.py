@@ -21,7 +21,7 @@ from sfa_localization.data.statistics import LENGTH_TO_STD
 LEAST_M = 0.01
 """Least correlation distance: images nearer to each other show the same place."""
 LARGEST_SHARE = 0.95
-"""Below 1, so that every image remains some evidence."""
+"""Largest share, below 1 so that every image adds some information."""
 _FARTHEST_M = 8.0  # errors of images farther apart hardly correlate
 _DISTANCES_M = np.geomspace(0.1, 20.0, 81)  # correlation distances that are tried
 _BINS_M = np.geomspace(0.02, _FARTHEST_M, 25)  # edges of the bins of the distance of two images

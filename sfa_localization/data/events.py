@@ -12,7 +12,7 @@ from sfa_localization.data.run import Stamps
 
 ODOMETRY, IMAGE = range(2)
 DELAY_LIMIT_NS = 500_000_000
-"""Largest delay of the camera's stamps, either way, that is compensated."""
+"""Largest delay of the camera's stamps, of either sign, that is compensated."""
 CLOCK_RANGE_S = 2.5
 """Largest difference of two clocks that turns show."""
 

@@ -28,8 +28,8 @@ _PAIR_NS, _PAUSE_NS = 1_000_000_000, 500_000_000  # pairs with longer ones betwe
 # An estimate applies to images stamped so much later, whichever message came first.
 _IN_TRANSIT_NS, _REMEMBERED_NS = 1_000_000_000, 10_000_000_000
 _WINDOW_NS = round(CLOCK_RANGE_S * 1e9) + 100_000_000
-# Residuals beyond _OUTLIER of _SCALE_RAD are mismatches of images and count no more; sums of them
-# within _ALIKE do not tell delays apart.
+# Residuals beyond _OUTLIER times _SCALE_RAD are mismatches, and clipped; delays whose costs differ
+# by less than _ALIKE fit equally well.
 _SCALE_RAD, _OUTLIER, _ALIKE = 0.05, 4.0, 1.0
 # Smaller turns, rad, and fewer do not show how well images and odometry agree.
 _TURN_RAD, _TURNS_MIN = 0.05, 10
@@ -42,8 +42,8 @@ _MEAN_OF_NORMAL = 0.798  # of |x|: sqrt(2 / pi)
 class CameraClock:
     """`delay_s` by which images are stamped later than odometry, with its standard deviation.
 
-    0 and infinity before turns that begin and end show it. An `assumed` delay is used even where it
-    is smaller than its standard deviation.
+    0 with infinite standard deviation until a turn has begun and ended. An `assumed` delay is used
+    even where it is smaller than its standard deviation.
     """
 
     delay_s: float = 0.0
@@ -129,7 +129,7 @@ class CameraClockFinder:
         limited, turning = np.minimum(residual, _OUTLIER), np.abs(driven) > _TURN_RAD
         for total, new in (
             (self._cost, limited),
-            # A moment more of delay changes the turn by the change of the turn rate.
+            # The derivative of a turn by the delay is the difference of the turn rates at its ends.
             (self._power, (residual < _OUTLIER) * np.gradient(driven, _STEP_S) ** 2),
             (self._turns, turning),
             (self._size, turning * np.abs(driven)),

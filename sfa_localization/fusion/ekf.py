@@ -92,8 +92,9 @@ class Ekf:
         self._kalman = kalman or Kalman()
 
     def blank(self, stamp_ns: int) -> Belief:
-        """The belief before the first message, without a pose: the robot is that of the rig, whose
-        scale and delay are applied to what comes in."""
+        """The belief before the first message, without a pose: the prior of the robot is the rig,
+        whose scale and delay are applied to all inputs.
+        """
         speed_std, rate_std, rig = self._config.speed_std, self._config.rate_std, self._rig
         scale_std = rig.wheel_scale.std / rig.wheel_scale.value
         of_robot = motion.BIAS_STD, scale_std, rig.turn_loss.std, rig.camera_delay.std
@@ -140,9 +141,9 @@ class Ekf:
         return moved._replace(twist=twists[1], odometry=odometry)
 
     def _broken(self, belief: Belief, event: OdometryEvent, leap: Jump) -> Belief:
-        """The belief after a break of the odometry, which may be a slip of the wheels' counts or a
-        robot that was moved: the pose is predicted by the last speed, and as uncertain as one that
-        is DEGRADED, until an image places it.
+        """The belief after a break of the odometry, by wrong wheel counts or a robot that was
+        moved: the pose is predicted with the last speed, and has the uncertainty of DEGRADED until
+        an image confirms it.
         """
         belief, std_m = self.coast(belief, event.stamp_ns), self._config.degraded_std
         noise = np.zeros((SIZE, SIZE))
@@ -195,7 +196,7 @@ class Ekf:
     def _started(
         self, belief: Belief, event: MeasurementEvent, images: tuple[PositionFix, ...]
     ) -> Belief:
-        """Start from one image with heading, or from the path along which several lie."""
+        """Start from one image with heading, or from several images that agree along the path."""
         config = self._config
         if event.value.size == 3:
             x, y, yaw = event.covariance.diagonal().tolist()

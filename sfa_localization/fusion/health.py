@@ -46,7 +46,7 @@ CAUTION, FLOOR_M, FLOOR_RAD, YAW_DRIFT = 4.0, 0.05, 0.02, 0.02
 """Factor on the variances of images and their least standard deviations, for errors that images of
 one place share; heading error of the odometry, rad per m."""
 DELAYS: Array = np.r_[-1.5:-0.2:0.3, 0.3, 0.6 : LONGEST_DELAY_S + 0.1 : 0.4]
-"""Delays s that are told apart, beside those that the camera's clock compensates."""
+"""Grid of delays, s, in addition to the compensated one."""
 LONGEST_M = 16.0
 """An estimate that was placed anew again and again is confirmed over this distance at most."""
 _ANYWHERE = 1 / (100.0 * 2 * math.pi)
@@ -97,7 +97,7 @@ def _sentence(fault: str, size: complex) -> str:
 
 
 def health_of(path: DrivenPath, fixes: Sequence[PositionFix]) -> Health:
-    """The health by images beside a path."""
+    """The health of an estimate from images along a path."""
     confirmed_m = max((fixes[-1].traveled_m if fixes else 0.0) - path.placed_m[-1], 0.0)
     # Each time that images which agree over as many meters place it anew doubles them.
     needed_m = min(AGREEING_M * 2.0 ** max(len(path.placed_m) - 2, 0), LONGEST_M)
@@ -115,7 +115,7 @@ def health_of(path: DrivenPath, fixes: Sequence[PositionFix]) -> Health:
 
 class _Hypothesis(NamedTuple):
     """What may be wrong, its size (seconds, m ahead + i m to the left, rad, or a factor), and
-    whether it puts the robot off by more than is harmless.
+    whether it displaces the robot by more than is harmless.
     """
 
     name: str

@@ -84,8 +84,8 @@ def jump(belief: Belief, event: OdometryEvent) -> Jump | None:
 
 
 def interval(belief: Belief, event: OdometryEvent) -> tuple[Twist, Twist] | None:
-    """The mean twist from the belief to an odometry message, and the twist to go on with; None
-    after a silence, where no pose shows the motion.
+    """The mean twist from the belief to an odometry message, and the twist from then on; None after
+    a silence without poses.
     """
     seconds, reading = silence_s(belief, event), event.twist
     mean = _mean_twist(belief, event, seconds)
@@ -115,8 +115,8 @@ def _mean_twist(belief: Belief, event: OdometryEvent, seconds: float) -> Twist |
 
 
 def _is_sideways_or_first(belief: Belief, event: OdometryEvent) -> bool:
-    """Whether the twist is right rather than the pose: because this moves more sideways than ahead,
-    which no robot on wheels does, or changes for the first time after twists that were used.
+    """Whether to trust the twist rather than the pose: the pose moves more sideways than ahead, or
+    changes for the first time after twists were used.
     """
     assert belief.odometry.pose is not None and event.pose is not None
     if not belief.odometry.renewed_ns and (belief.twist.v or belief.twist.omega):
@@ -157,7 +157,7 @@ def _remaining(belief: Belief, event: OdometryEvent, mean: Twist) -> Twist:
 
 
 def _moved(before: Pose, after: Pose) -> tuple[float, float, float]:
-    """How far a pose turned, and lies ahead and to the left, by the mean of both headings."""
+    """Turn and displacement (ahead, left) of a pose, in the frame of the mean of both headings."""
     turn = float(wrap_angle(after[2] - before[2]))
     c, s = math.cos(before[2] + turn / 2), math.sin(before[2] + turn / 2)
     dx, dy = after[0] - before[0], after[1] - before[1]

@@ -117,7 +117,7 @@ class PoseFilter:
     def set_pose(self, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike | None = None) -> None:
         """Set the pose (3,) in the map at a stamp; covariance (3, 3), or the configured one.
 
-        A stamp that does not fit those of the messages, before or after, gives way to theirs.
+        If the stamp does not fit those of the messages, their stamp is used.
         Raises DataError for a pose or covariance that cannot be one.
         """
         given = self._initial_covariance() if covariance is None else covariance
@@ -206,8 +206,8 @@ class PoseFilter:
             self._camera.add_heading(int(stamp_ns), yaw_rad)
 
     def expect(self, rig: Rig) -> None:
-        """Begin with what training learned of the robot; what was learned under way stays. Turns
-        under way overrule the camera's delay.
+        """Take the rig of the training as prior. Estimates since the start stay; the camera delay
+        by turns since the start takes precedence.
         """
         self._rig, self._ekf = rig, Ekf(self.config, self.correlation, rig)
         self.scale = rig.wheel_scale.value * self.config.odometry_scale
@@ -274,7 +274,9 @@ class PoseFilter:
         return self._at(stamp_ns)
 
     def _at(self, stamp_ns: int) -> State | None:
-        """A robot that is commanded is where its odometry was a delay ago, and its images right."""
+        """If odometry repeats commands, the robot is where the odometry was one delay ago, and
+        images are in time.
+        """
         robot_ns, delay_ns = stamp_ns, self._camera.clock.delay_ns if self._open_loop.repeats else 0
         if 0 < abs(delay_ns) <= DELAY_LIMIT_NS and self._history.reaches(stamp_ns - delay_ns):
             robot_ns -= delay_ns
@@ -283,13 +285,13 @@ class PoseFilter:
 
     @property
     def _newest(self) -> Belief:
-        """At the newest message, also where it adds nothing."""
+        """The belief at the newest message, even if that was not used."""
         newest, newest_ns = self._history.newest, self._history.newest_ns
         return self._ekf.coast(newest, newest_ns) if newest_ns else newest
 
     @property
     def health(self) -> Health:
-        """What the last images show of the estimate."""
+        """The health of the estimate by the last images."""
         belief = self._history.newest
         judged = newest_new(belief.memory.images), belief.path.placed_m
         if self._judged is None or self._judged[0] != judged:

@@ -21,14 +21,15 @@ from sfa_localization.fusion.belief import ENOUGH_IMAGES, Belief, Columns, Posit
 from sfa_localization.fusion.motion import YAW
 
 FEW_IMAGES = 3
-"""Agreement that is no coincidence: two images always agree on some motion, the third checks."""
+"""Fewest agreeing images: two always agree on some motion; the third is the test."""
 AGREEING_M, AGREEING_STDS = 2.0, 3.0
 """Distance over which images must agree, because nearer ones share their errors, and standard
 deviations within which two of them do."""
 START_YAW_STD = 0.3
 """rad: positions alone must determine the heading to this; the EKF is linear enough up to there."""
 AGREEING_PER_OTHER = 3
-"""With fewer agreeing images per accepted one on the same path, the estimate is rather right."""
+"""Agreeing images needed per accepted one on the same path; with fewer the estimate is more likely
+right."""
 OBVIOUS_JUMP_M = 1.5
 """A larger displacement shows that the robot was moved; a smaller one may be the map's error."""
 _TINY = 1e-12  # keeps the variance finite where a lone position shows no turn
@@ -58,7 +59,7 @@ class Relocation(NamedTuple):
         images, support = self.images, belief.memory.support
         if images < AGREEING_PER_OTHER * self.contradicting or images <= self.dissenting:
             return False
-        # A young estimate is overruled by one image more than it rests on.
+        # A new estimate is overruled by one image more than support it.
         enough = images >= min(ENOUGH_IMAGES, max(2, support + 1))
         if not enough or self.covariance[YAW, YAW] > START_YAW_STD**2:
             return False

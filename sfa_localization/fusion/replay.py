@@ -54,7 +54,7 @@ def replay(
     """Feed all odometry, and measurements at their stamps (M,), in the order of time.
 
     Yields (stamp, measurement, update) of each measurement, and (stamp, None, None) of each message
-    of the odometry that was used; later ones have no part in what the filter then believes.
+    of the odometry that was used; the filter's state then does not depend on later ones.
     """
     images = iter(measurements)
     for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, stamps_ns):

@@ -7,8 +7,8 @@ Jacobian F to (x-, P-), and what followed smoothed that to (x*, P*). Then
 
     C = P F' (P-)^-1    x <- x + C (x* - x-)    P <- P + C (P* - P-) C'
 
-from the last belief back to the first. Where the filter started, or was placed anew, nothing of
-later beliefs reaches earlier ones.
+from the last belief back to the first. Smoothing does not pass a start or a relocation of the
+filter.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _RIDGE = 1e-12  # keeps the inverse of a covariance of unit diagonal finite
 
 
 class _Prediction(NamedTuple):
-    """What it started from, its Jacobian, and what it led to."""
+    """The state before a prediction, its Jacobian, and the predicted state."""
 
     before: Belief
     jacobian: Array

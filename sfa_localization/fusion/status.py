@@ -20,8 +20,8 @@ from sfa_localization.fusion.relocation import FEW_IMAGES
 from sfa_localization.fusion.settings import FilterConfig
 
 LEAST_SILENCE_S, MOST_SILENCE_S, PERIODS = 1.4, 3.0, 1.25
-"""Images are missed after 1.25 of their usual periods, within these limits: meanwhile the robot may
-be towed or carried away, and nothing shows it."""
+"""Images are reported missing after 1.25 usual periods, within these limits: without images nothing
+shows that the robot is carried away."""
 DEGRADED_YAW_RAD = 0.2
 """A heading with a larger standard deviation leads the robot a meter astray within a few."""
 
@@ -43,7 +43,7 @@ class Status:
     reasons: tuple[str, ...] = ()
 
     def with_reasons(self, lost: Sequence[str], degraded: Sequence[str]) -> Status:
-        """With more reasons; no reason makes a filter that has not begun worse."""
+        """Add reasons and lower the level; UNINITIALISED stays."""
         level = Level.LOST if lost else Level.DEGRADED if degraded else Level.LOCALISED
         if self.level is Level.UNINITIALISED or self.level.value > level.value:
             level = self.level

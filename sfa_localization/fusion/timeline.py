@@ -23,7 +23,7 @@ FEW_AHEAD, FEW_BEHIND = 3, 5
 or the clock has gone back."""
 AHEAD = 'stamp ahead of those before'
 _AGAIN_NS = 300_000_000
-"""Time that odometry has to cover once more until the clock is taken to have gone back."""
+"""Duration of repeated odometry stamps after which the clock is considered set back."""
 
 
 class ClockWentBack(Exception):
@@ -39,8 +39,8 @@ class Timeline:
         self._leaps: list[tuple[int, int, Callable[[], object]]] = []
         self._retaking = False
         self._other_clock, self._period_ns = (0, 0), 0
-        # Odometry in a row that is no newer than what came before it: how many of its messages lie
-        # among those, and the first and last stamp.
+        # Consecutive odometry with old stamps: how many messages lie among earlier ones, and the
+        # first and last stamp.
         self._again = 0, 0, 0
 
     def require_order(
@@ -111,7 +111,7 @@ class Timeline:
         self, stamp_ns: int, newest_ns: int | None, history: History[Event, Belief]
     ) -> None:
         """Raises ClockWentBack for odometry that covers once more, in order, what other odometry
-        covered before it; what fills a hole, or comes out of order, was held up.
+        covered before it; odometry that fills a gap, or is out of order, was only delayed.
         """
         among, first_ns, last_ns = self._again
         if newest_ns is None or stamp_ns > newest_ns:

@@ -34,7 +34,8 @@ STRETCH_M = 6.0
 """Images that are nearer along the same drive are alike because they are neighbors."""
 SAMPLES = 3000
 """Images that are compared, however long the drives."""
-# The coarse correlation leaves so many images for the full one; half of them show half of a tilt.
+# Candidates that the coarse correlation passes to the full one; with half as many only half of a
+# tilt is recovered.
 _CANDIDATES = 24
 
 
@@ -56,7 +57,9 @@ class Closures:
         return cls(np.zeros((0, 2), np.int64), np.zeros(0))
 
     def of_robot(self, camera_yaw: Array) -> Closures:
-        """With the turns of the robot, on which the camera is turned by (N,) rad in N images."""
+        """The same with turns of the robot instead of the camera, whose yaw on the robot is (N,)
+        rad in N images.
+        """
         first, second = camera_yaw[self.images].T
         return Closures(self.images, self.turn - second + first)
 
@@ -119,8 +122,8 @@ class ImageSearch:
         self._coarse = coarse(self.spectra)
 
     def candidates(self, row: int, rows: Indices) -> Indices:
-        """Those of the images `rows` (M,) that are about likest another one, without those of the
-        same stretch of driving.
+        """Those of the images `rows` (M,) with the highest coarse correlation with another one,
+        except those of the same stretch of the drive.
         """
         rows = rows[~self.views.near(row, rows)]
         scores = coarse_scores(self.spectra[row], self._coarse[rows])
@@ -132,9 +135,9 @@ class ImageSearch:
 
 
 def find_closures(views: Textures, clockwise: bool) -> Closures:
-    """Images of two drives, or of a drive with itself, each of which is the likest of the other, or
-    a neighbor of that, if they are like enough; of an even sample, whose pairs are all compared.
-    `clockwise`: whether columns grow clockwise seen from above.
+    """Images of two drives, or of a drive with itself, each of which is the best match of the
+    other, or next to it, with a correlation of at least LIKE. All pairs of an even sample are
+    compared. `clockwise`: whether columns grow clockwise seen from above.
     """
     views = views.take(evenly(len(views.images), SAMPLES))
     search, rows = ImageSearch(views), np.arange(len(views.images))

@@ -6,13 +6,13 @@ Keyframes locate an image along each axis with variance
 
     v_k = f^2 + (a s)^2 + (b o ln(1 + u))^2,
 
-where u is the part that no place explains (`Fit.unlike`), o how far outward of the keyframes the
-image is, and s how far its residual moves the place; the logarithm, because likeness decays
-exponentially with the distance. Slow features, whose map claims a variance c, locate it with
-v_s = g c + (h ln(1 + u))^2. The parameters maximize the likelihood of the true places of images
-left out: first f, a and b by keyframes alone, then g and h by both together, so that errors which
-both share are counted. Errors are Student's: see `surprise`. a is at least 1, because s shows what
-light does also where all images are of one light.
+where u is the part that no place explains (`Fit.unlike`), o how far outside the keyframes the image
+is, and s the displacement that the residual causes; the logarithm, because correlation decays
+exponentially with the distance. Slow features, whose map claims a variance c, locate it with v_s =
+g c + (h ln(1 + u))^2. The parameters maximize the likelihood of the true places of images left out:
+first f, a and b by keyframes alone, then g and h by both together, so that errors which both share
+are counted. Errors are Student's: see `surprise`. a is at least 1, because s shows what light does
+also where all images are of one light.
 """
 
 from __future__ import annotations
@@ -28,12 +28,14 @@ from sfa_localization.data.statistics import MEDIAN_TO_STD, surprise
 from sfa_localization.keyframes.regression import Fit
 
 LEAST_STD, LEAST_M = 1e-3, 0.01
-"""rad, m: nobody knows a pose better. (With 1 mm, ellipses held 69 % in another light.)"""
+"""rad, m: least standard deviations of a pose. (With 1 mm, ellipses contained 69 % of the errors in
+another light.)"""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorModel:
-    """The parameters, and the errors that all images share, which images left out do not show.
+    """The parameters, and the standard deviations of errors that all images share, which left-out
+    images cannot show.
 
     `floor_m` is f, `residual` a, `outward_m` b, `slow` g, `slow_m` h. `yaw_std` rad is the
     standard deviation of a heading, times 1 + u. `map_m` and `turn_std` rad are those of the map,
@@ -117,8 +119,8 @@ class LeftOut:
         least: dict[str, float],
         errors_of: Callable[[ErrorModel], tuple[Array, Array]],
     ) -> ErrorModel:
-        """The parameters named in `least`, where their least values are, that maximize the
-        likelihood of errors (M, 2) m with variances (M,) m^2, which depend on the parameters.
+        """The parameters, named in `least` with their lower bounds, that maximize the likelihood of
+        errors (M, 2) m with variances (M,) m^2, which depend on the parameters.
         """
         from scipy.optimize import minimize  # for training alone
 

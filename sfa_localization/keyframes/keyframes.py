@@ -33,11 +33,11 @@ from sfa_localization.keyframes.texture import (
 from sfa_localization.keyframes.tilt import derivatives
 
 FEWEST = 6
-"""Least keyframes of a regression: a place, slopes along both axes, and as many to spare."""
+"""Fewest keyframes of a regression: three parameters, and as many spare."""
 NEIGHBORS = 64
 """Keyframes of a regression, of each light."""
 LIGHTS = 3
-"""An image is located in so many lights of the training at most."""
+"""Most lights of the training in which an image is located."""
 # An image that is farther from the place about which its keyframes were chosen is located again.
 # From 0 to 0.2 m the errors are the same.
 _NEAR_M = 0.2
@@ -137,8 +137,8 @@ class Keyframes:
         return np.sort(np.concatenate([of_light, added]))
 
     def fit_about(self, image: Spectra, place: Array, yaw: float, light: int) -> Fit:
-        """Where the spectrum (rows, F) of an image is among the keyframes of a light about a place
-        (2,) m; again about the place of the fit, if that is not near.
+        """Locate the spectrum (rows, F) of an image by the keyframes of one light around a place
+        (2,) m; repeat around the result if that is far away.
         """
         fit = self.fit(image, yaw, self.around(place, light))
         if np.hypot(*(fit.place - place)) > _NEAR_M:
@@ -148,7 +148,7 @@ class Keyframes:
     def fit(self, image: Spectra, yaw: float, rows: Indices) -> Fit:
         """Where the spectrum (rows, F) of an image with about this yaw rad is among some keyframes.
 
-        What roll, pitch and a turn change of the image is projected out, and estimated.
+        Changes of the image by roll, pitch and heading are projected out, and estimated.
         """
         slopes = spectrum(derivatives(columns_of(image, self.columns), self.channels, self.sphere))
         by_turn = image * (1j * np.arange(image.shape[1])).astype(np.complex64)

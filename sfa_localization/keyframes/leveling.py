@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drives over uneven ground, leveled before anything is learned from them.
 
-Two images of one place, turned to one heading, show the difference of their tilts. No image says
-what is level; but all together, each is level as surely as one such pair is right: the tilts t_i,
-roll + j pitch in rad, minimize
+Two images of one place, turned to one heading, show the difference of their tilts. No image shows
+what is level. Together all pairs determine the tilts, with level images as prior: t_i, roll + j
+pitch in rad, minimize
 
     sum_ij |t_i - exp(j a_ij) t_j - r_ij|^2 + sum_i |t_i|^2
 
@@ -37,8 +37,8 @@ def leveled_runs(
     sphere: Sphere,
     on_images: Callable[[int], object] = lambda count: None,
 ) -> tuple[Run, ...]:
-    """The runs with leveled panoramas; unchanged where most images are as tilted as those they are
-    likest. Of many images each set of `SAMPLES`, from all over the drives, is leveled by itself.
+    """The runs with leveled panoramas; unchanged if most images have the same tilt as their best
+    matches. Of many images each set of `SAMPLES`, from all over the drives, is leveled by itself.
     """
     counts = [len(run.panoramas) for run in runs]
     sets = -(-sum(counts) // SAMPLES)

@@ -4,8 +4,8 @@
 
 The sun shines on the same sides of all things, so that much of what it adds to an image is a
 pattern over the directions, the same wherever the robot is. The residual of images, averaged over
-many places, is that pattern. Without the pattern, images of another light lie where those of the
-training did; with it, all are moved alike, because it resembles a change of place.
+many places, is that pattern. After the pattern is subtracted, images in another light are located
+as in training. Otherwise all are displaced alike, because the pattern resembles a change of place.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from sfa_localization.keyframes.location import SCALES, Location
 from sfa_localization.keyframes.regression import BORDER
 from sfa_localization.keyframes.texture import Spectra
 
-# Places over which the pattern is averaged, about ten meters of driving; the weight, in places, of
-# no pattern at the start; and their spacing, m: a robot that stands learns nothing.
+# Places over which the pattern is averaged, about ten meters of driving; the weight of the initial
+# zero pattern, in places; and the spacing of places, m: a standing robot adds none.
 _AVERAGED, _BEFORE, _SPACING_M = 40, 10, 0.25
 # Share of the newest image in the probabilities of scales: they follow about ten images.
 _NEWEST = 0.1
@@ -42,7 +42,7 @@ class Conditions:
         """Learn from an image that was located with these conditions."""
         self.scales = self.scales + _NEWEST * (location.scales - self.scales)
         place, fit = location.pose[:2], location.fit
-        # At the border of the keyframes, the residual also comes of the place.
+        # At the border of the keyframes the residual is also due to the place.
         if fit.outward > BORDER or np.hypot(*(place - self._last)) < _SPACING_M:
             return
         self._places, self._last = self._places + 1, place

@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where an image was taken, and how sure that is: one mixture of Gaussians.
+"""The pose of an image and its covariance: one mixture of Gaussians.
 
-Each keyframe about as like the image as the likest one starts a hypothesis h, if no other one
-starts near it at about the same heading: a regression among its neighbors puts the image at p_h
+Each keyframe whose correlation is close to the highest one starts a hypothesis h, unless another
+one starts near it with a similar heading: a regression among its neighbors puts the image at p_h
 with variance v_h (`ErrorModel`), and leaves the part u_h of it unexplained. An image counts as n
 independent numbers (`PARTS`):
 
@@ -36,12 +36,12 @@ from sfa_localization.keyframes.texture import Spectra, columns_of, turned
 from sfa_localization.keyframes.upright import UprightImage, without
 
 STARTS, SPACING_M, SPACING_RAD = 3, 1.0, 0.5
-"""Hypotheses start at so many keyframes at most, so far from each other, or turned so far: one
-regression tells nearer places apart."""
+"""Most starts, and their least distance in position or heading: one regression resolves nearer
+places."""
 LESS_LIKE = 0.1
 """The correlation with such a keyframe is at most so much less than that with the likest one."""
 SCALES = 3.0 ** np.arange(8)
-"""Of the variance of slow features, up to standard deviations that are 47 times as large."""
+"""Scales of the variance of slow features, up to 47 times the standard deviation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +62,8 @@ class Location:
 def hypotheses(
     keyframes: Keyframes, image: UprightImage, pattern: Spectra | None
 ) -> tuple[list[Fit], Array]:
-    """Where an image may have been taken, without the `pattern` (rows, F) of its light and without
-    the tilt that the likeliest hypothesis finds; and its whole tilt, (2,) rad.
+    """Hypotheses of an image, after the `pattern` (rows, F) of its light and the tilt of the most
+    likely hypothesis are removed; and its total tilt (2,) rad.
     """
     likely = _from_starts(keyframes, image, pattern)
     upright = without(keyframes, image, _remaining_tilt(likely))
@@ -106,7 +106,7 @@ def located(
     near = np.where(here[:, None], weight, 0.0) / by_fit[here].sum()
     place, of_fit = np.tensordot(near, means, 2), near.sum(axis=1)
     yaw = float(np.angle(of_fit @ np.exp(1j * yaws)))
-    # Without the covariance of place and heading: another place is no error of this one.
+    # The covariance of position and heading omits the other hypotheses.
     covariance, offset = np.zeros((3, 3)), means - place
     covariance[:2, :2] = np.einsum('hs,hsi,hsj->ij', weight, offset, offset)
     covariance[:2, :2] += float((weight * by_keyframes * (1 - gain)).sum()) * np.eye(2)
@@ -143,8 +143,8 @@ def _starts(keyframes: Keyframes, image: UprightImage) -> list[tuple[float, floa
 
 
 def _headings(keyframes: Keyframes, image: UprightImage, row: int) -> list[float]:
-    """The heading rad at which an image is likest a keyframe, and another one at which it is about
-    as like it: in a corridor, turned by 180 degrees.
+    """The heading rad with the highest correlation with a keyframe, and a second one with nearly
+    the same: in a corridor, turned by 180 degrees.
     """
     first, columns = float(image.yaws[row]), keyframes.columns
     product = (keyframes.aligned([row])[0] * image.visible.conj()).sum(axis=0)

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closures with measured offsets: where an image lies among those of other tracks around it.
+"""Loop closures with measured offsets: positions of images relative to images of other tracks.
 
 The place that local regression (regression.py) gives an image is linear in those of the others,
 sum_k c_k p_k. The shares c_k depend on the images alone: they hold in any frame, however bent the
@@ -22,13 +22,13 @@ from sfa_localization.keyframes.keyframes import FEWEST, NEIGHBORS, Keyframes
 # Spacing of the views that are located, along a drive or in a turn, which shows where the camera
 # sits: the errors of nearer ones are alike.
 _SPACING_M, _SPACING_RAD = 0.5, 0.5
-# An image of which more than this part is unlike all around is of another place, or beside them.
+# An image whose unexplained part exceeds this was taken at another place, or outside of the others.
 _UNLIKE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Offsets:
-    """R of the images of all drives that lie at the mixture, by `shares` (R, K) of sum 1, of the
+    """R images, each of which lies at the weighted mean, by `shares` (R, K) of sum 1, of the
     places of `others` (R, K), and are turned by `turn` (R, K) rad from each; `unlike` (R,) is that
     of the fit.
     """

@@ -1,11 +1,11 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where among neighboring keyframes an image was taken: a regression of their places on textures.
+"""The position of an image among neighboring keyframes: a regression of positions on textures.
 
 Turned to one heading, the textures q_k of N keyframes at places p_k differ by how far things move
 over the panorama, which is about linear in the place over some decimeters. The mean of each drive
 (its light), the likeness to the mean of all, and the changes by roll, pitch and heading are
-projected out. Another light takes part of all differences away, for which the image is scaled. With
+projected out. Another light reduces all differences by one factor, so the image is scaled. With
 A the Gram matrix of the residual textures, a their products with the residual image, and w the
 weights of likeness, ridge regression gives
 
@@ -32,12 +32,12 @@ _LIKENESS = 0.05
 # regression would follow each of them.
 _RIDGE = 0.005
 BORDER = 0.6
-"""Beyond this `Fit.outward` a place is at the border of the keyframes, or beside them."""
+"""Beyond this `Fit.outward` a place is at the border of the keyframes, or outside."""
 PARTS = 60
 """Independent numbers that an image counts as: neighboring pixels are one. From 20 to 200, places
 are the same."""
 _TINY = 1e-6
-# Parts of the panorama in which light, or what hides the view, is one error: 22.5 degrees.
+# Sectors of the panorama within which errors by light or occlusion are correlated: 22.5 degrees.
 _SECTORS = 16
 # An image keeps at least this part of its likeness to the mean of the keyframes in any light.
 _LEAST_GAIN = 0.2
@@ -49,12 +49,12 @@ class Fit:
     (N,) of sum 1; its heading `yaw` rad; and the `changes` (3,) rad of roll, pitch and heading that
     it shows.
 
-    `unlike` is the square of what the place leaves unexplained of the image, over that of what it
-    explains. `residual` (rows, F) is the spectrum of the former, and `variance` m^2 what it makes
-    of the place, along each axis, if sectors of the panorama err independently. `outward` is the
-    distance of the place from the middle of the keyframes, over their mean distance from it: 0
-    among them, 0.64 at a straight border of theirs, 1 far beside all. `facing` is the mean of
-    exp(i yaw) of the keyframes; `start` numbers the place about which they were chosen.
+    `unlike` is the squared norm of the unexplained part of the image over that of the explained
+    part. `residual` (rows, F) is the spectrum of the unexplained part, and `variance` m^2 per axis
+    the position variance that it causes if sectors of the panorama err independently. `outward` is
+    the distance of the place from the middle of the keyframes, over their mean distance from it: 0
+    among them, 0.64 at a straight border of theirs, 1 far beside all. `facing` is the mean of exp(i
+    yaw) of the keyframes; `start` numbers the place about which they were chosen.
     """
 
     place: Array
@@ -99,7 +99,7 @@ def regress(
     parts = (weighted[:, part].reshape(len(spectra), -1).view(np.float32) for part in channels)
     products = np.stack([part @ part.T for part in parts]).astype(float)
     basis = _Basis.of(products[:, count, :count].sum(axis=0), drives, places)
-    # What part of its likeness to the mean the image keeps, so does it of all differences.
+    # The image keeps the same share of its differences as of its likeness to the mean.
     mean = products[:, :count, :count] @ basis.mean
     likeness = products[:, count, :count] @ basis.mean
     gains = np.maximum(likeness / np.maximum(mean @ basis.mean, 1e-12), _LEAST_GAIN)
@@ -197,8 +197,8 @@ def _regression(products: Array, basis: _Basis) -> tuple[Array, Array, Array, fl
 def _moved_by_sectors(
     residual: Spectra, along: Sequence[Spectra], trust: Texture, columns: int
 ) -> Array:
-    """By how much, m, each sector of the panorama moves the place, (2, sectors): light and what
-    hides the view are alike within a sector, and differ between sectors.
+    """Displacement (2, sectors) m that the residual of each sector causes: errors by light and
+    occlusion are correlated within a sector, independent between sectors.
     """
     textures = columns_of(np.stack([residual, *along]), columns)
     moved = trust @ (textures[1:] * textures[0])

@@ -35,7 +35,7 @@ _BLUR = 1 / 37.5
 # Added to the brightness (8 bit) and to the standard deviation of its logarithm: the noise of dark
 # and of plain surfaces stays small beside texture.
 _DARKEST, _FLATTEST = 8.0, 0.1
-# Textures have one byte a number: so many steps make a standard deviation.
+# Quantization of textures to one byte: steps per standard deviation.
 _STEPS = 127 / 4.0
 
 

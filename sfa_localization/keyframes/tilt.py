@@ -61,8 +61,8 @@ def find_tilt(
     channels: Sequence[slice],
     sphere: Sphere,
 ) -> tuple[Array, Array]:
-    """Roll and pitch (M, 2) rad with which a texture is likest each of M level ones, and the
-    correlations (M,), reduced for large tilts.
+    """Roll and pitch (M, 2) rad with the highest correlation between a texture and each of M level
+    ones, and the correlations (M,), reduced for large tilts.
 
     The textures are given by the spectra of their columns, (rows, F) and (M, rows, F); the others
     have the heading of the image when `turned` by `turn` (M,) rad. `channels` are rows of one

@@ -33,8 +33,8 @@ def choose_keyframes(
     textures: NDArray[np.int8], poses: Array, sphere: Sphere, drives: NDArray[np.int32]
 ) -> tuple[Keyframes, Indices]:
     """Of textures (N, rows, columns) of training images, their poses (N, 3) in the map, and the
-    numbers (N,) of their drives, some that are spread over the ground: of each square meter as
-    many, chosen at random, always the same. Drives in the same light get one number.
+    numbers (N,) of their drives, choose some evenly over the ground: equally many per square meter,
+    at random with a fixed seed. Drives in the same light get one number.
 
     The keyframes, and which images (K,) they are. Raises DataError for too few images.
     """

@@ -24,7 +24,8 @@ SPOT_M, TURNS_RAD = 0.02, (0.3, 1.5)
 AHEAD_M, STRAIGHT_RAD = (0.05, 0.65), 0.08
 """Way and turn between two images that show what a way changes."""
 FREQUENCIES = 10
-"""The lowest ones change with the square of the way, and without error by a part of a column."""
+"""Number of low frequencies compared: they change with the square of the distance, and do not
+depend on shifts by a fraction of a column."""
 UNSURE = 0.5
 """Relative error of the square: things are nearer in some places than in others (1.3 to 1.9 of what
 it should be, in five drives)."""

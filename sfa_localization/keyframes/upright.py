@@ -24,18 +24,19 @@ from sfa_localization.keyframes.tilt import find_tilt, visible
 
 # The coarse correlation leaves so many keyframes for the full one.
 _CANDIDATES = 64
-# An image is leveled to so many likest keyframes: with a tilt the first may be of another place.
+# Number of best-matching keyframes to which an image is leveled: under a tilt the first may be of
+# another place.
 _LEVELED = 16
-# Tilts that are tried for an image that is unlike all keyframes: beyond 8 degrees even one of a
-# known place is, and each of these tilts makes it like them up to 6 degrees farther.
+# Tilts that are tried for an image that is unlike all keyframes: beyond 8 degrees even an image of
+# a trained place is unlike them, and each of these tilts extends the range by 6 degrees.
 _EIGHTHS = np.arange(8) * np.pi / 4
 _STEEP_RAD = np.radians(8.0) * np.column_stack([np.cos(_EIGHTHS), np.sin(_EIGHTHS)])
 
 
 @dataclass(frozen=True, slots=True)
 class UprightImage:
-    """The `panorama` (H, W, 3) that a level robot would see, made of the one that was `seen` with a
-    `tilt`, roll and pitch (2,) rad.
+    """The `panorama` (H, W, 3) that a level robot would see, computed from the original, `seen` at
+    a `tilt`, roll and pitch (2,) rad.
 
     `spectrum` (rows, F) is that of its texture, `visible` that of the part that was seen, scaled so
     that its correlations are those of the whole. `scores` (K,) are the correlations with the
@@ -57,8 +58,8 @@ class UprightImage:
 
 
 def upright(keyframes: Keyframes, panorama: Image) -> UprightImage:
-    """A panorama (H, W, 3) uint8 BGR without the roll and pitch that make it likest one of the
-    keyframes that it is likest anyway, or would be with a large tilt.
+    """A panorama (H, W, 3) uint8 BGR without the roll and pitch that maximize its correlation with
+    a keyframe, among those that match it best as it is, or after a large tilt.
     """
     level = _leveled(keyframes, _compared(keyframes, panorama, np.zeros(2)))
     if level.score >= LIKE_A_PLACE:
@@ -92,7 +93,7 @@ def _compared(
         masks = [visible(tilt, n, keyframes.columns, keyframes.sphere) for n in heights]
         mask = np.concatenate(masks)
         seen = image * mask
-        # What was not seen would count as unlike.
+        # Rows that were not seen would count as differences.
         seen /= max(float(np.linalg.norm(seen)), 1e-6) * np.sqrt(mask.mean())
         part = spectrum(seen)
     if rows is None:

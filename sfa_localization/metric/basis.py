@@ -84,7 +84,7 @@ class Process:
     """
 
     scale: Array
-    """(K,) weight of each feature over the kernel's length."""
+    """(K,) weight of each feature, divided by the length scale of the kernel."""
     points: Array
     """(m, K) scaled inducing features."""
     noise: float

@@ -28,13 +28,15 @@ robot."""
 STEP = 0.2
 """m or rad, by odometry, between two images that are compared."""
 STILL, STRAIGHT = 1 / 20, 0.25
-"""Images stand that change by less than this share of what is usual for their way: those of a
-standing robot by 1/500, of a driving one by 1/7 or more (two gardens, four real logs). Usual is the
-lower quartile over the ways ahead, as images change more where the robot also turns."""
+"""Images stand still if they change by less than this share of the usual change for the distance
+driven: those of a standing robot by 1/500, of a driving one by 1/7 or more (two gardens, four real
+logs). The usual change is the lower quartile over distances driven straight, because images change
+more in turns."""
 STANDING, STOOD_S = 0.01, 1.0
 """Slower wheels, m/s or rad/s, stand; a robot that stands so long may be carried."""
 OTHER = 0.05
-"""The share of all neighboring images, by likeness, that may show another place."""
+"""Quantile of the correlations of neighboring images below which an image may show another
+place."""
 # s around a step in which its usual speed is measured.
 _AROUND_S = 0.5
 # Correlations below are those of noise.
@@ -42,8 +44,8 @@ _LEAST_LIKE = 1e-2
 
 
 def _jumps(odometry: Odometry) -> tuple[Mask, Array, float]:
-    """Mask (N - 1,) of the steps that no speed around them explains, the steps (N - 1, 3) by the
-    motion around them, and the standard deviation, m, of the others about these.
+    """Mask (N - 1,) of impossible steps, the steps (N - 1, 3) interpolated from the motion around
+    them, and the standard deviation, m, of the regular steps from these.
     """
     step, dt = relative(odometry.poses[:-1], odometry.poses[1:]), np.diff(odometry.stamps_ns) * 1e-9
     period = max(float(np.median(dt)), 1e-3)

@@ -31,8 +31,8 @@ With more, the links are so weak that maps shrink by 4 %."""
 
 
 class Way(NamedTuple):
-    """The way of a drive, from the way that its wheels counted: `scale` times it, less a `loss`
-    (m per radian) in turns, of standard deviation `loss_std`.
+    """The correction of a drive's wheels: distance = `scale` * counted - `loss` (m per radian) *
+    turned; `loss_std` is the standard deviation of the loss.
     """
 
     scale: float = 1.0
@@ -163,7 +163,7 @@ def spaced(sums: Array, least: float) -> Indices:
 
 def pauses(odometry: Odometry) -> Mask:
     """Mask (N - 1,) of the pauses of odometry; short ones with equal twists before and after do not
-    count: drivers that repeat a command, or speak only when it changes, pause like that.
+    count: drivers that publish only when a command changes pause like that.
     """
     twists, poses = odometry.twists, odometry.poses
     twists = twists if twists.any() else differences(odometry.stamps_ns, poses)

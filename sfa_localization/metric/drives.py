@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The drives that a map is learned from: odometry, what images show of its errors, and segments.
+"""The drives of a training: odometry, its errors as measured by images, and segments.
 
 Images correct the turns of the wheels and, once there is a map, the way (odometry_errors.py).
 """
@@ -47,7 +47,7 @@ SCALE_STD = 0.01
 _MOUNT_ROUNDS, _MOUNT_SETTLED_M = 4, 0.02
 """Offsets are measured again until the camera's place moves by less than their error."""
 _LOSS_ROUNDS = 2
-"""The first map hides a third of the way that wheels lose in turns, the next one a tenth."""
+"""The first map underestimates the loss in turns by a third, the next one by a tenth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ class Drives:
             yield drive.stamps_ns[rows[inside]], result.mount.base(poses[inside], number)
 
     def ways(self, segments: Segments, result: MetricResult) -> list[Way | None]:
-        """The way of each drive by the map, where its wheels lose some in turns.
+        """The correction of each drive's wheels by the map, if they lose distance in turns.
 
         All have one scale, that of the map: single drives do not show it better.
         """
@@ -224,8 +224,8 @@ def with_points(
     drives: Drives, segments: Segments, maps: Maps, again: Callable[[Segments], Maps]
 ) -> tuple[Segments, Maps]:
     """Segments and maps in the coordinates and meters of the measured points, if there are any: the
-    last map shows what these say, and all are learned `again`; once more where the map that the
-    points bend straight shows other ones to be right.
+    points are fitted to the last map, and everything is learned `again`; and once more if the
+    corrected map changes which points are inliers.
     """
     for _ in range(_POINT_ROUNDS if segments.points else 0):
         assert segments.points is not None

@@ -33,11 +33,11 @@ def plane(points: Complex) -> Array:
 
 
 def place_variance(fit: MapFit) -> Array:
-    """How uncertain the segments leave the map at the place of each image, (M,) m^2 over both axes,
-    relative to the whole map.
+    """Variance (M,) m^2, over both axes, of the map at each image due to the segments, relative to
+    the whole map.
 
     The map is a regression to the places of all images: it repeats the errors that neighbors share.
-    The errors of one image it averages out; images that are left out show those.
+    It averages out the independent errors of single images, which left-out images measure.
     """
     sample = evenly(len(fit.places), SAMPLED)
     variance = fit.graph.variance(fit.ridge.averages(sample))

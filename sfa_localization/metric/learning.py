@@ -212,7 +212,7 @@ def learn_turned(
     for start in range(0, len(images), _BATCH):
         part = slice(start, start + _BATCH)
         features[images[part]] = turned.features(spectra[images[part]], yaw[part])
-    # They count by their own size, as principal components do.
+    # The principal components keep their variances as weights.
     scale = np.full(features.shape[1], 1.0 / np.sqrt(features[images].var(0).sum()))
     return turned, learn_metric(features, segments, MetricConfig(), seed, scale, first)
 
@@ -225,8 +225,8 @@ def with_turned(
     config: MetricConfig,
     seed: int = 0,
 ) -> tuple[TurnedMaps | None, MetricResult]:
-    """As `learn_turned`; the first map alone without a layer to turn, where no other can be
-    learned, and for the paper's descent and its monomials, which are there for comparison.
+    """As `learn_turned`. Returns the first map if the network has no layer to turn, if the second
+    map cannot be learned, and for the paper's descent and monomials.
     """
     if spectra is None or config.solver == 'paper' or config.metric_map == 'monomials':
         return None, first

@@ -7,9 +7,9 @@
     |o_{n+1} - o_n - z_n displacement_n|^2         displacements: not in the paper
 
 each over its variance, turns to first order in the biases. Messages and data sheets state noise of
-wheels on a good floor. Where residuals are larger, the variances of the drive grow. A solution
-follows its links, so that residuals are smaller than errors: a link adds to the degrees of freedom
-1 minus the variance of its residual in the solution over its own.
+wheels on a good floor. Where residuals are larger, the variances of the drive grow. The solution
+fits its links, so residuals underestimate errors: each link adds 1 minus its posterior variance
+over its prior variance to the degrees of freedom.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from sfa_localization.metric.stack import SegmentPoses, Stack
 
 # The factor of a run and the weights of outliers are found in turn, far more often than needed.
 _STEPS = 10
-# The stated variances count as so many links whose residuals fit them.
+# The stated variances weigh as much as this many links whose residuals agree with them.
 _PRIOR_LINKS = 10.0
 
 

@@ -33,8 +33,8 @@ from sfa_localization.metric.stack import SegmentPoses, Stack
 # the least factor on them.
 _TURN_STD, _PLACE_STD_M, _ALIKE, _CLOSURE_UNLIKE, _LEAST = 0.005, 0.65, 0.03, 0.5, 0.2
 _DRIFT_M, _DRIFT = 1.0, 0.1
-"""Odometry never errs by more than this, and this part of the distance driven: with wheels that
-slip it errs by 5 %."""
+"""Bound of the odometry's error: this many m plus this share of the distance driven (slipping
+wheels: 5 %)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,9 @@ class Loops:
 
 
 def rough_offsets(closures: Closures) -> Offsets:
-    """Closures as offsets of 0 m: good enough for a graph that finds the neighbors of images."""
+    """Closures without measured offsets, taken as 0 m: accurate enough to find the neighbors of
+    images.
+    """
     images, turn = closures.images, closures.turn[:, None]
     unlike = np.full(len(turn), _CLOSURE_UNLIKE)
     return Offsets(images[:, 1], images[:, :1], np.ones_like(turn), turn, unlike)
@@ -120,8 +122,9 @@ def _squares(
 
 
 def with_closures(segments: Segments, closures: Closures) -> Segments:
-    """Segments with the closures that are possible by their odometry, where it is unbroken: doors
-    of a corridor and trees in rows look alike."""
+    """Remove the closures that unbroken odometry excludes: doors of a corridor and trees in rows
+    look alike.
+    """
     stack = Stack.of(segments)
     owner, (x, y, yaw) = stack.owner, stack.starts[stack.owner].T
     places, driven = x + 1j * y + np.exp(1j * yaw) * stack.path, np.cumsum(stack.steps)

@@ -29,11 +29,11 @@ from sfa_localization.metric.settings import MetricConfig
 from sfa_localization.metric.stack import SegmentPoses, Stack
 
 LINK_WEIGHT = 2.0
-"""Weight of odometry's links over that by their variances: noise of the features contracts the map,
-because least squares takes it for noise of the places, and the links counteract that."""
+"""Factor on the weight of the odometry's links. Noise of the features contracts the map; heavier
+links counteract that."""
 # m^2 per axis: a start that the first round replaces.
 _FIRST_VARIANCE = 0.04
-# Paths of odometry are no better than this, however well a map fits them.
+# Least standard deviation of odometry paths.
 _NOISE_MIN_M = 1e-3
 # Rounds, and the relative change of the variance of images that ends them.
 _ROUNDS, _SETTLED = 8, 0.01
@@ -52,7 +52,7 @@ class MetricProblem:
     links: Links
     config: MetricConfig
     seed: int = 0
-    """Of the parts that are left out, and of the points that the forecast draws."""
+    """Seed of the left-out parts, and of the points of the forecast."""
     graph: Graph | None = None
     """Without features, where offsets or points tie the drive better than features do."""
 
@@ -83,8 +83,8 @@ class MapFit:
     links: Links
     """With the variances of the last round."""
     image_variance: float
-    """m^2: eq. 1 is divided by it, that is by `variance`, by how many images count as one because
-    their residuals are correlated, and by LINK_WEIGHT."""
+    """m^2: divisor of eq. 1: `variance`, times the number of correlated images that count as one,
+    times LINK_WEIGHT."""
     residuals: Complex
     """(M,) where the segments put an image minus where the map does, meters."""
     map_weights: Complex
@@ -123,7 +123,7 @@ class MapFit:
         return _form(self.stack, self.links, ridge.gram(self.stack), self.image_variance)
 
     def without(self, rows: Indices) -> tuple[Ridge, SegmentPoses]:
-        """The regression without some images, and the poses, which read them by eq. 1 alone."""
+        """The fit without some images: its regression and its poses."""
         ridge = self.ridge.without(rows)
         if self.problem.graph is not None:
             return ridge, self.graph.poses

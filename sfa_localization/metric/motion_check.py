@@ -47,11 +47,11 @@ SKIDDING = 5.0
 FASTEST_MPS = 30.0
 """A faster robot publishes other units than meters."""
 SIDEWAYS, SLIGHT_TURN = 0.25, 1.0
-"""Nothing slips sideways by more than this share of the way ahead while it turns by less than the
-second, rad, in a second, not even the frame of a robot beside its axle; twice that is no slip."""
+"""Largest sideways share of the motion below the second value, rad/s, even for a base frame off the
+axle; twice as much is a wrong heading, not slip."""
 ASKEW, UNEVEN = np.deg2rad(1.0), np.deg2rad(10.0)
-"""A heading that is farther beside the way, as of a gyroscope that is mounted askew, is corrected
-where the spread is below the second: slipping wheels spread more."""
+"""A heading that deviates by more than this from the direction of motion (a gyroscope mounted
+askew) is corrected if its scatter is below the second value; slipping wheels scatter more."""
 # Fewer stamps, in all and in each second, do not show their unit.
 _STAMPS_MIN, _STAMPS_MIN_PER_S = 20, 3
 _UNITS = ((1, 'nothing'), (1_000, 'milliseconds'), (1_000_000, 'microseconds'))

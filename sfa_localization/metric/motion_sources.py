@@ -30,8 +30,8 @@ LOCKED = 0.4
 """Images that turn by less than this share are stabilized by the camera; skidding wheels turn twice
 as far as the robot."""
 EQUAL = 1.5
-"""Larger ratios of two sources are neither sampling nor loosely calibrated wheels; a ratio that is
-that of two units within this factor is explained by them."""
+"""A ratio of two sources beyond this factor is neither sampling nor calibration; within this factor
+of a ratio of units, the units explain it."""
 WHOLE, CERTAIN = 1.15, 0.95
 """The stricter limit for images whose correlation exceeds the second: panoramas that show a whole
 turn were within 3 %."""
@@ -42,9 +42,9 @@ _WINDOWS_S, _STEP, _WINDOWS_MAX = 0.19 * 2.0 ** np.arange(4), 0.1, 3000
 _PAUSE_S = 1.0
 _GRID = np.arange(-50, 51) * (CLOCK_RANGE_S / 50)
 _OUTLIER = 3.0  # times the typical step
-# A delay is certain where those that fit about as well spread by less, s (of a quarter of them).
+# A delay is certain if the delays that fit nearly as well scatter by less than this, s.
 _STD_MAX_S = 0.06
-# Maps are compared with odometry over so many m: much more than one image errs.
+# Distance, m, over which maps and odometry are compared: many times the error of one image.
 _STRETCH_M = 10.0
 
 

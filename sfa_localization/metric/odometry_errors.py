@@ -29,8 +29,8 @@ from sfa_localization.metric.dead_reckoning import OdometryTrack, Way, spaced, s
 CLOSURES_MIN = 30
 """Fewer closures show by chance that images turn better."""
 BETTER = 2.0
-"""Images are used if the noise of their turns is smaller by this factor: others change little, and
-their errors are not as white as those of good odometry."""
+"""Images are used if the noise of their turns is smaller by this factor: otherwise they gain
+little, and their errors are less white than those of good odometry."""
 # rad per square root of s: closures err by a fraction of a degree, and show no smaller noise.
 _LEAST_NOISE = 1e-4
 STEP_M = 0.3

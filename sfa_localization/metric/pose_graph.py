@@ -35,10 +35,11 @@ CERTIFICATE_TOLERANCE = 1e-9
 YAW_BIAS_STD = 0.003
 """rad/s: prior of the yaw-rate bias of odometry or a gyroscope, estimated per period."""
 SAMPLED = 500
-"""Links, or images, of which uncertainties are computed: those between are alike."""
+"""Number of links or images whose variances are computed; the others are interpolated."""
 # Poses and the weights of residuals are estimated in turn: so often that neither changes much.
 _ROUNDS = 3
-# Weak priors of origins (1 / m^2) and directions (1 / rad^2), for drives that nothing ties.
+# Weak priors of origins (1 / m^2) and directions (1 / rad^2), for drives without links to the
+# others.
 _ORIGIN_PRIOR, _DIRECTION_PRIOR = 1e-8, 1e-3
 # Newton's steps, halvings of a step, and the decrease of the cost that ends them.
 _STEPS, _HALVINGS, _CONVERGED = 100, 20, 1e-8
@@ -66,7 +67,7 @@ class Graph:
     certificate: Certificate
     factor: SuperLU
     mount: Mount = field(default_factory=Mount)
-    """The camera's place by these poses, one step on from that of the segments."""
+    """The mount estimated at these poses, one Gauss-Newton step from that of the segments."""
 
     @classmethod
     def of(cls, segments: Segments) -> Graph:
@@ -95,8 +96,9 @@ class Graph:
 
     @classmethod
     def solved(cls, form: Any, stack: Stack, start: SegmentPoses | None = None) -> Graph:
-        """The minimum of a form (3N, 3N) near a start, or near the path of the odometry; where it
-        is not proven, that from the smallest eigenvector of the form, if it is better."""
+        """The minimum of a form (3N, 3N) near a start, or near the path of the odometry; if it has
+        no certificate, the minimum from the smallest eigenvector of the form, if that is better.
+        """
         x, y, yaw = stack.starts.T
         zeros = np.zeros(stack.period[-1] + 1)
         start = start or SegmentPoses(np.exp(1j * yaw), x + 1j * y, zeros)
@@ -168,7 +170,7 @@ class Graph:
         return stated.learned(links, residuals, uncertain)
 
     def _sampled(self, rows: Any, part: Callable[[Complex], Any] = np.asarray) -> Array:
-        """Variance (L,) of a part of rows (L, 3N) times y: of a sample, interpolated."""
+        """Variance (L,) of rows (L, 3N) times y, computed for a sample of rows and interpolated."""
         count = rows.shape[0]
         if not count:
             return np.zeros(0)

@@ -59,7 +59,9 @@ class Ridge:
         return np.asarray(scipy.linalg.cho_solve((self.factor, True), right))
 
     def averages(self, rows: Indices) -> Array:
-        """Shares (K, M), of sum 1, by which the map at some images averages the places of all."""
+        """Shares (K, M), of sum 1, with which the map at some images averages the places of all
+        images.
+        """
         shares = scipy.linalg.cho_solve((self.factor, True), self.expanded[rows].T)
         shares = (self.expanded @ shares * self.weights[:, None]).T
         return np.asarray(shares / shares.sum(axis=1, keepdims=True))

@@ -147,7 +147,7 @@ def on_the_ground(fit: MapFit) -> tuple[Array, Array]:
 def held_out_error(basis: Basis, now: MapFit, weight: Array) -> float:
     """Mean error, m, by a weight (M,), of held-out images in a regression to the places of now.
 
-    The evidence would take neighbors that err alike for proof of little noise.
+    The evidence would mistake correlated errors of neighbors for low noise.
     """
     ridge, places = Ridge.of(basis, now.problem.features), now.places
     return sum(

@@ -24,8 +24,8 @@ from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.metric.segments import Segments, assignment
 
 _TRACK_SHARE = 0.5
-"""Part of the length of a segment that closures with an earlier one span at least; on a track that
-crosses they span half a meter."""
+"""Least share of a segment's length over which closures connect it with an earlier one on the same
+track; on a crossing track they cover half a meter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +149,7 @@ class SegmentPoses:
 def tracks(segments: Segments) -> Indices:
     """For each of the N segments the first segment along the same track (N,): mostly itself.
 
-    A part of the drive that is held out to check a map stands for places that were never seen.
-    Where a later drive follows the same track, its images would give the place away: both are held
-    out together.
+    A held-out part represents unseen places, so all segments along one track are held out together.
     """
     track, pairs = np.arange(len(segments)), segments.closures.images
     if not len(pairs):

@@ -22,7 +22,7 @@ NODES = {
     'ekf_node': 'ROS 2 node: poses and odometry to the pose in the map.',
 }
 CANNOT_START, DIED = 1, 2
-"""Exit codes: a launch ends with a node that cannot start, and starts a node again that died."""
+"""Exit codes: a launch ends if a node cannot start, and restarts a node that died."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

@@ -75,7 +75,7 @@ def judgment(trained: Trained) -> tuple[str, str]:
     trusted = quality['certified'] and quality['left_out_within_95'] >= TRUSTED_SHARE
     care = too_sparse(trained.metric.poses, InspectionConfig().max_spacing)
     if quality.get('expected_yaw_error_deg', 0.0) > GOOD_DEG:
-        care.append('images look alike from several headings, and perhaps places')
+        care.append('images look alike at several headings, and perhaps at several places')
     if expected > GOOD_M or not trusted:
         care.append('see where it is weak')
     if care:

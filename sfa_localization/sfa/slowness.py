@@ -20,7 +20,7 @@ import numpy as np
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 
-# Relative variance that is within the rounding error of sums of float32 products.
+# Relative variance below the rounding error of sums of float32 products.
 _ROUNDING = 1e-9
 
 
