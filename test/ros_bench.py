@@ -6,6 +6,7 @@ And the nodes as processes in the same domain.
 """
 
 import contextlib
+import gc
 import os
 import subprocess
 import sys
@@ -165,3 +166,5 @@ class Bench:
             end_node(node)
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
+        self.nodes.clear()
+        gc.collect()  # rclpy's state machines keep nodes, which must not end while others start
