@@ -232,7 +232,7 @@ def inspect(
         report.odometry_topic = _topic_of(bag, 'odometry', topics.odometry, report)
         _Survey(bag, report, topics, clockwise).fill()
         report.problems, report.notes = bag.problems, bag.recording.notes
-    if _one_route(report.places):
+    if _single_route(report.places):
         report.notes.append(ROUTE)
     if path_length(report.places) >= 1.0 and not headings_differ(report.places):
         report.notes.append(NO_LEVER_ARM)
@@ -406,7 +406,7 @@ def directions(places: Array) -> int:
     return int((share >= MIN_SHARE).sum())
 
 
-def _one_route(places: Array) -> bool:
+def _single_route(places: Array) -> bool:
     """Whether training will learn a route, not an area, from images at places (M, 3)."""
     moved = len(places) > 1 and path_length(places) >= 1.0
     return moved and is_one_route(places[:, 0] + 1j * places[:, 1], PIECE_LENGTH_M)
@@ -476,7 +476,7 @@ def _lacks_of_drive(places: Array, config: InspectionConfig, whole: bool) -> Ite
         yield 'the robot did not move: drive it over the area'
         return
     yield from too_sparse(places, config.max_spacing)
-    if not whole or _one_route(places):
+    if not whole or _single_route(places):
         return
     yield from sparse_lanes(places, config.reach)
     if directions(places) < MIN_DIRECTIONS:
