@@ -138,11 +138,11 @@ def _await_subscribers(
 
 def _sleep_until(due: float, ticker: Publisher | None, stamp_ns: int, rate: float) -> None:
     """Sleep until `due`, by time.monotonic(); `stamp_ns` is the bag's time then, for /clock."""
-    while (left_s := due - time.monotonic()) > 0:
+    while (remaining_s := due - time.monotonic()) > 0:
         if ticker is not None:
-            seconds, nanoseconds = divmod(stamp_ns - int(left_s * rate * 1e9), 10**9)
+            seconds, nanoseconds = divmod(stamp_ns - int(remaining_s * rate * 1e9), 10**9)
             ticker.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
-        time.sleep(min(left_s, CLOCK_PERIOD_S))
+        time.sleep(min(remaining_s, CLOCK_PERIOD_S))
 
 
 def message_class(kind: str) -> Callable[..., Any] | None:
