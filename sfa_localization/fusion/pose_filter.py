@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filter: odometry drives a CTRV extended Kalman filter, images correct it at their stamp.
 
-One class serves the live node, the command line and the evaluation. What it believes after any
-set of messages depends on their stamps, not on the order or the pace in which they came, as long
-as none is older than HISTORY_NS.
+One class serves the live node, the command line and the evaluation. The estimate depends on the
+stamps of the messages, not on the order or pace of their arrival, unless one is older than
+HISTORY_NS.
 """
 
 from __future__ import annotations
@@ -58,9 +58,8 @@ _CLOCK_MEMORY = 1000.0
 class PoseFilter:
     """Fuses odometry with positions (2,) or poses (3,) in the map; see FilterConfig.
 
-    `correlation` is how the errors of neighboring images correlate. `counts` holds what became of
-    all messages, `scale` the factor on the way of odometry. No message raises; what is unusable is
-    counted.
+    `correlation` is that of the errors of neighboring images, `scale` the factor on the way of
+    odometry. No message raises: `counts` says how many were used, and why others were not.
     """
 
     def __init__(
@@ -117,7 +116,7 @@ class PoseFilter:
     def set_pose(self, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike | None = None) -> None:
         """Set the pose (3,) in the map at a stamp; covariance (3, 3), or the configured one.
 
-        A stamp that does not fit those of the messages, before or after, gives way to theirs.
+        The newest message's stamp replaces one that is far from it.
         Raises DataError for a pose or covariance that cannot be one.
         """
         given = self._initial_covariance() if covariance is None else covariance
@@ -274,7 +273,7 @@ class PoseFilter:
         return self._at(stamp_ns)
 
     def _at(self, stamp_ns: int) -> State | None:
-        """A robot that is commanded is where its odometry was a delay ago, and its images right."""
+        """Where odometry repeats commands, the robot follows late: the delay is not the camera's."""
         robot_ns, delay_ns = stamp_ns, self._camera.clock.delay_ns if self._open_loop.repeats else 0
         if 0 < abs(delay_ns) <= DELAY_LIMIT_NS and self._history.reaches(stamp_ns - delay_ns):
             robot_ns -= delay_ns
@@ -283,13 +282,13 @@ class PoseFilter:
 
     @property
     def _newest(self) -> Belief:
-        """At the newest message, also where it adds nothing."""
+        """The belief at the stamp of the newest message."""
         newest, newest_ns = self._history.newest, self._history.newest_ns
         return self._ekf.coast(newest, newest_ns) if newest_ns else newest
 
     @property
     def health(self) -> Health:
-        """What the last images show of the estimate."""
+        """The health of the estimate by the last images."""
         belief = self._history.newest
         judged = newest_new(belief.memory.images), belief.path.placed_m
         if self._judged is None or self._judged[0] != judged:

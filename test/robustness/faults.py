@@ -1,9 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What goes wrong: each fault makes the messages of a drive from what happened.
+"""Faults and lies: each changes the messages of a recorded drive, most from FROM_S to UNTIL_S.
 
-Most last from FROM_S to UNTIL_S of the drive; the robot drives properly before and after. FAULTS
-are made of pictures and odometry; LIES, of what an image shows: they contradict nothing at first.
+FAULTS change pictures and odometry; LIES, which contradict nothing at first, the poses by images.
 """
 
 import functools
@@ -30,7 +29,7 @@ DOWN_S = 2.0
 STANDING_HZ = 5
 """Rate of pictures where the robot stands."""
 LAP = 0.5
-"""Of the drive, which is two laps."""
+"""Share of the drive, which is two laps."""
 IMAGE_PERIOD_S = 0.25
 """By rounding, another machine may reject an image earlier or later."""
 SLIP_S, DARK_S, CARRIED_S = 8.0, 4.0, 9.0

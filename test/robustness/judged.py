@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a drive with a fault gave: how wrong, how long wrong and sure, how soon right again."""
+"""The verdict on a drive: errors, seconds LOCALISED and wrong, and time to recover."""
 
 import math
 from typing import NamedTuple
