@@ -34,7 +34,7 @@ _FORGIVEN_M = 30.0  # an estimate that was right for so long was not moved for n
 ENOUGH_IMAGES = 5
 """Images in a row that overrule an established estimate: half a second to a second of a camera."""
 DOUBT_STDS = 2.0
-"""While lost, the difference from the images is taken as an error of so many sigma (95 %)."""
+"""While lost, the last innovation counts as an error of so many standard deviations (95 %)."""
 
 
 class OdometryEvent(NamedTuple):

@@ -104,7 +104,7 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
     noise = factor * matrix
     least = np.square(_LEAST_STDS[: pose.size])
     np.fill_diagonal(noise, np.maximum(factor * variances, least))
-    return pose, noise
+    return pose, _positive(noise)
 
 
 def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filter: odometry drives a CTRV extended Kalman filter, images correct it at their stamp.
 
-One class serves the live node, the command line and the evaluation. What it believes after any
-set of messages depends on their stamps, not on the order or the pace in which they came, as long
-as none is older than HISTORY_NS.
+One class serves the live node, the command line and the evaluation. The estimate depends on the
+stamps of the messages, not on the order or pace of their arrival, unless one is older than
+HISTORY_NS.
 """
 
 from __future__ import annotations
@@ -58,9 +58,8 @@ _CLOCK_MEMORY = 1000.0
 class PoseFilter:
     """Fuses odometry with positions (2,) or poses (3,) in the map; see FilterConfig.
 
-    `correlation` is how the errors of neighboring images correlate. `counts` holds what became of
-    all messages, `scale` the factor on the way of odometry. No message raises; what is unusable is
-    counted.
+    `correlation` is that of the errors of neighboring images, `scale` the factor on the way of
+    odometry. No message raises: `counts` says how many were used, and why others were not.
     """
 
     def __init__(
@@ -285,7 +284,7 @@ class PoseFilter:
 
     @property
     def _newest(self) -> Belief:
-        """The belief at the newest message, even if that was not used."""
+        """The belief at the stamp of the newest message."""
         newest, newest_ns = self._history.newest, self._history.newest_ns
         return self._ekf.coast(newest, newest_ns) if newest_ns else newest
 

@@ -28,8 +28,7 @@ deviations within which two of them do."""
 START_YAW_STD = 0.3
 """rad: positions alone must determine the heading to this; the EKF is linear enough up to there."""
 AGREEING_PER_OTHER = 3
-"""Agreeing images needed per accepted one on the same path; with fewer the estimate is more likely
-right."""
+"""Agreeing images must outnumber the accepted ones on the same path by this factor."""
 OBVIOUS_JUMP_M = 1.5
 """A larger displacement shows that the robot was moved; a smaller one may be the map's error."""
 _TINY = 1e-12  # keeps the variance finite where a lone position shows no turn

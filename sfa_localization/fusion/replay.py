@@ -53,8 +53,8 @@ def replay(
 ) -> Iterator[tuple[int, M | None, Update | None]]:
     """Feed all odometry, and measurements at their stamps (M,), in the order of time.
 
-    Yields (stamp, measurement, update) of each measurement, and (stamp, None, None) of each message
-    of the odometry that was used; the filter's state then does not depend on later ones.
+    Yields (stamp, measurement, update) after each measurement, and (stamp, None, None) after each
+    message of the odometry that was used.
     """
     images = iter(measurements)
     for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, stamps_ns):

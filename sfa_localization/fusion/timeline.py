@@ -27,11 +27,11 @@ _AGAIN_NS = 300_000_000
 
 
 class ClockWentBack(Exception):
-    """The clock went back: whoever knows the time starts anew."""
+    """The clock went back: the filter has to start anew."""
 
 
 class Timeline:
-    """Feed it the stamps of all messages; it says which can be used."""
+    """Decides by the stamps of all messages, in the order of arrival, which can be used."""
 
     def __init__(self) -> None:
         self._behind = 0

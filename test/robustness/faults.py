@@ -1,9 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The faults: each makes the messages of a drive with this fault.
+"""Faults and lies: each changes the messages of a recorded drive, most from FROM_S to UNTIL_S.
 
-Most last from FROM_S to UNTIL_S of the drive; before and after, everything works. FAULTS change
-pictures and odometry. LIES change the poses of images so that they contradict nothing at first.
+FAULTS change pictures and odometry; LIES, which contradict nothing at first, the poses by images.
 """
 
 import functools
@@ -29,7 +28,7 @@ DOWN_S = 2.0
 STANDING_HZ = 5
 """Rate of pictures where the robot stands."""
 LAP = 0.5
-"""Of the drive, which is two laps."""
+"""Share of the drive, which is two laps."""
 IMAGE_PERIOD_S = 0.25
 """By rounding, another machine may reject an image earlier or later."""
 SLIP_S, DARK_S, CARRIED_S = 8.0, 4.0, 9.0

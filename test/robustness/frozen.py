@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What reaches the filter in each fault, recorded once, so that the filter is judged in seconds."""
+"""The messages to the filter in each fault, recorded once: they judge the filter in seconds."""
 
 import io
 import json

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Judge a drive with a fault: errors, seconds LOCALISED and wrong, and time to recover."""
+"""The verdict on a drive: errors, seconds LOCALISED and wrong, and time to recover."""
 
 import math
 from typing import NamedTuple
