@@ -142,6 +142,8 @@ def test_a_signal_at_any_moment_ends_with_exit_code_0(start):
 WRONG = [
     ('sfa_node', ['-p', 'model:=/nowhere/model.npz'], '/nowhere/model.npz'),
     ('ekf_node', ['-p', 'speed_std:=.nan'], 'speed_std'),
+    ('ekf_node', ['-p', 'use_sim_time:=3'], "'use_sim_time'"),
+    ('ekf_node', ['-p', 'qos_overrides./odom.subscription.reliability:=x'], 'QoS override'),
     ('ekf_node', ['--params-file', 'keyless.yaml'], 'before ros__parameters at line 2'),
     ('ekf_node', ['--lost_std', '2'], "ROS cannot use its arguments: ['--lost_std', '2']"),
 ]

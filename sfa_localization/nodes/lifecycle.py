@@ -18,6 +18,7 @@ from typing import Any, TypeVar, cast
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -245,8 +246,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             self.every(DIAGNOSTICS_PERIOD_S, self._publish_health)
             self.setup()
         except Exception as error:
-            expected = isinstance(error, LocalizationError)
-            self.failure = str(error) if expected else traceback.format_exc()
+            self.failure = _reason(error)
             if self.context.ok():  # else a signal is the cause
                 self.get_logger().error(f'cannot start: {self.failure}')
             self._release()
@@ -301,7 +301,6 @@ def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
     The process must end afterwards, because it ignores signals then.
     """
     node = None
-    logger = rclpy.logging.get_logger(_PACKAGE)
     try:
         _initialize(words)
         executor = SingleThreadedExecutor()  # after a signal it cannot be made
@@ -312,14 +311,10 @@ def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
         executor.add_node(node)
         with one_core():
             _spin(executor, node)
-    except LocalizationError as error:
-        logger.fatal(str(error))
-        return entry.CANNOT_START
-    except Exception:
-        if not rclpy.ok():
-            return 0  # after a signal ROS cannot be used any more
-        logger.fatal(traceback.format_exc())
-        return entry.DIED if node is not None and node.active else entry.CANNOT_START
+    except Exception as error:
+        if rclpy.ok() or isinstance(error, LocalizationError):  # else a signal is the cause
+            rclpy.logging.get_logger(_PACKAGE).fatal(_reason(error))
+            return entry.DIED if node is not None and node.active else entry.CANNOT_START
     finally:
         if node is not None:
             node.attempt('cleanup', node.teardown)
@@ -344,6 +339,15 @@ def _initialize(words: list[str]) -> None:
             f'unknown arguments {others}: give parameters as --ros-args -p NAME:=VALUE, and topics '
             'as --ros-args -r NAME:=TOPIC'
         )
+
+
+def _reason(error: Exception) -> str:
+    """The message of an expected error; the traceback of an error in the program."""
+    if isinstance(error, LocalizationError):
+        return str(error)
+    if isinstance(error, (ParameterException, RuntimeError)):
+        return f'{error}: correct this parameter of ROS, or the qos_overrides of the topic'
+    return traceback.format_exc()
 
 
 def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:

@@ -130,8 +130,6 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self.unsubscribe(self._subscription)
         self._subscription = self._listening_since_s = None
 
-    # Images.
-
     def _use_message(self, message: ImageMessage | CompressedImage) -> None:
         stamp_ns, image = convert.read_image(message)
         self._publish(image, stamp_ns, self._config.frame_id or message.header.frame_id)
@@ -207,8 +205,6 @@ class OmnicamNode(lifecycle.LocalizationNode):
         size = self._size or (lens and (lens.image_height, lens.image_width)) or (0, 0)
         if lens and 0 not in size:
             unwrapper.visible(size)
-
-    # Health.
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         details = {'camera model': self._unwrapper.model}

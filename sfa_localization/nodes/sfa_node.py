@@ -110,8 +110,6 @@ class SfaNode(LocalizationNode):
         model = self._observer.model
         self._rig.publish(convert.to_rig(model.rig, model.error_correlation))
 
-    # Images.
-
     def _receive_info(self, message: String) -> None:
         self._declared = convert.read_info(message)
 
