@@ -273,7 +273,7 @@ class PoseFilter:
         return self._at(stamp_ns)
 
     def _at(self, stamp_ns: int) -> State | None:
-        """Where odometry repeats commands, the robot follows late: the delay is not the camera's."""
+        """Where odometry repeats commands, the robot follows late, and the camera is not late."""
         robot_ns, delay_ns = stamp_ns, self._camera.clock.delay_ns if self._open_loop.repeats else 0
         if 0 < abs(delay_ns) <= DELAY_LIMIT_NS and self._history.reaches(stamp_ns - delay_ns):
             robot_ns -= delay_ns
