@@ -76,18 +76,19 @@ def criss_cross(lines, half=(8.0, 9.0), seed=0, shortest=8.0):
     return np.vstack(parts), start
 
 
-def lanes(length, gap, count, left=True):
-    """Twists of parallel lanes to and fro, `gap` apart, the first turn to the left or the right."""
+def lanes(length, gap, count, first=1):
+    """Twists of parallel lanes to and fro, `gap` apart, the first turn to the left, or right
+    (-1)."""
     parts = []
     for k in range(count):
-        side = np.pi / 2 if (k % 2 == 0) == left else -np.pi / 2
+        side = first * (-1) ** k * np.pi / 2
         parts += [straight(length), turn(side), straight(gap), turn(side)]
     return np.vstack(parts)
 
 
 def grid(length, gap, count):
     """Twists of a mower's square: an odd number of lanes along x, then as many across them."""
-    return np.vstack([lanes(length, gap, count), turn(np.pi / 2), lanes(length, gap, count, False)])
+    return np.vstack([lanes(length, gap, count), turn(np.pi / 2), lanes(length, gap, count, -1)])
 
 
 def meander(length, half=(8.0, 9.0), seed=0, speed=1.0):
@@ -128,15 +129,15 @@ def garden_features(places, *, noise=0.0, count=12, seed=0, world=0):
 def mixtures(stack, poses, noise_m=0.0, count=400, seed=0, lasting=False):
     """Offsets of images among six others within 1.5 m, whose places explain theirs; `lasting`
     errors fade within 1 m along the drive. Turns err by 0.1 rad per meter of these."""
-    rng, found = np.random.default_rng(seed), []
+    rng, rows = np.random.default_rng(seed), []
     errors = noise_m * rng.standard_normal((len(stack.images), 2))
     fades = np.exp(-stack.steps) if lasting else np.zeros(len(errors))
     for row, part in enumerate(fades[1:], 1):
         errors[row] = part * errors[row - 1] + np.sqrt(1 - part**2) * errors[row]
     places = poses[stack.images]
     for row in rng.permutation(len(places))[:count]:
-        apart = np.hypot(*(places - places[row])[:, :2].T)
-        near = np.flatnonzero((apart < 1.5) & (np.abs(stack.owner - stack.owner[row]) > 1))
+        distance = np.hypot(*(places - places[row])[:, :2].T)
+        near = np.flatnonzero((distance < 1.5) & (np.abs(stack.owner - stack.owner[row]) > 1))
         if len(near) >= 12:
             near = rng.permutation(near)[:6]
             design = np.column_stack([places[near, :2], np.ones(6)]).T
@@ -144,5 +145,5 @@ def mixtures(stack, poses, noise_m=0.0, count=400, seed=0, lasting=False):
             shares = np.linalg.lstsq(design, wanted, rcond=0.02)[0]
             turn = wrap_angle(places[row, 2] - places[near, 2] + 0.1 * errors[row, 0])
             if np.allclose(design @ shares, wanted):  # not where they lie on a line
-                found.append((stack.images[row], stack.images[near], shares, turn, 0.1))
-    return Offsets(*map(np.array, zip(*found, strict=True)))
+                rows.append((stack.images[row], stack.images[near], shares, turn, 0.1))
+    return Offsets(*map(np.array, zip(*rows, strict=True)))

@@ -19,7 +19,6 @@ from metric_worlds import (
 from scipy import sparse
 
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform, align, wrap_angle
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.keyframes.closures import STRETCH_M, Closures, Textures, find_closures
@@ -113,8 +112,8 @@ def in_two_lights():
     return poses, features, join(parts, [0, first]), first
 
 
-def true_closures(poses, first, wrong=0.0, seed=0):
-    rng = np.random.default_rng(seed)
+def true_closures(poses, first):
+    rng = np.random.default_rng(0)
     near = [
         (a, b)
         for a in range(0, first, 2)
@@ -123,11 +122,7 @@ def true_closures(poses, first, wrong=0.0, seed=0):
     ]
     pairs = np.array(near)
     turn = wrap_angle(poses[pairs[:, 1], 2] - poses[pairs[:, 0], 2])
-    turn = turn + rng.normal(0, 0.005, len(turn))
-    lies = rng.random(len(pairs)) < wrong
-    pairs[lies, 1] = rng.integers(first, len(poses), int(lies.sum()))
-    turn[lies] = rng.uniform(-np.pi, np.pi, int(lies.sum()))
-    return Closures(pairs, turn)
+    return Closures(pairs, turn + rng.normal(0, 0.005, len(turn)))
 
 
 def errors_of(result, poses):
@@ -141,9 +136,6 @@ def errors_of(result, poses):
 @pytest.mark.parametrize('wrong', [0.0, 0.15])
 def test_offsets_tie_drives_that_share_no_feature(wrong, quick):
     poses, features, segments, _ = in_two_lights()
-    if not wrong:
-        with pytest.raises(DataError, match='directions are uncertain'):
-            learn_metric(features, segments, GP)
     offsets, rng = mixtures(Stack.of(segments), poses), np.random.default_rng(0)
     lies = rng.random(len(offsets.images)) < wrong
     turn = np.where(lies[:, None], rng.uniform(-np.pi, np.pi, offsets.turn.shape), offsets.turn)
@@ -186,8 +178,9 @@ def test_offsets_hold_in_any_frame():
     elsewhere = np.column_stack([moved.apply(poses[:, :2]), poses[:, 2] + moved.yaw_rad])
     same = find_offsets(seen, elsewhere, CONFIG.sphere)
     assert np.array_equal(same.images, offsets.images)
-    again = (same.shares[:, :, None] * poses[same.others, :2]).sum(1)
-    np.testing.assert_allclose(again, mixed, atol=0.01)
+    order, its = np.argsort(offsets.others), np.argsort(same.others)
+    pair = np.take_along_axis(offsets.shares, order, 1), np.take_along_axis(same.shares, its, 1)
+    np.testing.assert_allclose(*pair, atol=1e-3)
 
 
 def test_closures_lead_to_the_neighbors_that_offsets_are_measured_to():
@@ -247,7 +240,7 @@ def test_angles_that_wind_around_a_ring_are_no_minimum():
 
 def test_the_graph_errs_as_it_says():
     errors, stated = [], []
-    for seed in range(12):
+    for seed in range(8):
         poses, _, segments = measured_world(0.05, seed)
         stack, graph = Stack.of(segments), Graph.of(segments)
         rows = stack.first
@@ -279,14 +272,14 @@ def test_odometry_that_turns_wrongly_misleads_no_graph():
     run = drive(twists, start=start, bias=0.06, yaw_noise=0.05)
     segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
     offsets = mixtures(Stack.of(segments), run.poses, 0.03, count=1000)
-    found = Graph.of(dataclasses.replace(segments, offsets=offsets))
-    assert found.certificate.certified and found.poses.bias == pytest.approx(0.06, abs=0.01)
+    graph = Graph.of(dataclasses.replace(segments, offsets=offsets))
+    assert graph.certificate.certified and graph.poses.bias == pytest.approx(0.06, abs=0.01)
 
 
-def test_what_nothing_ties_is_known_to_be_unknown():
+def test_what_nothing_ties_is_uncertain():
     _, _, segments, _ = in_two_lights()
-    one = Graph.of(dataclasses.replace(segments, items=segments.items[:1]))
-    assert one.certificate.certified and abs(one.poses.z[0]) == pytest.approx(1.0)
+    single = Graph.of(dataclasses.replace(segments, items=segments.items[:1]))
+    assert single.certificate.certified and abs(single.poses.z[0]) == pytest.approx(1.0)
     graph, first = Graph.of(segments), [s.run for s in segments].count(0)
     between = np.eye(len(segments))[0] - np.eye(len(segments))[first]
     assert graph.certificate.certified
@@ -300,7 +293,7 @@ def test_where_offsets_tie_a_drive_features_do_not_bend_it(quick):
     assert first == pytest.approx(second, rel=1e-9) and first < 0.1
 
 
-def twice_along_one_track(sideways=0.1):
+def twice_along_a_track(sideways=0.1):
     """A drive, and a second one along the same track, somewhat aside."""
     twists, start = criss_cross(8, seed=1)
     aside = (start[0], start[1] + sideways, start[2])
@@ -313,7 +306,7 @@ def twice_along_one_track(sideways=0.1):
 
 
 def test_a_segment_along_an_earlier_track_has_its_number():
-    _, segments = twice_along_one_track()
+    _, segments = twice_along_a_track()
     track = tracks(segments)
     half = [s.run for s in segments].count(0)
     assert (track[:half] == np.arange(half)).mean() > 0.9
@@ -336,7 +329,7 @@ def test_doors_of_a_corridor_that_look_alike_close_no_loop():
 
 
 def test_what_is_held_out_is_held_out_of_every_drive_along_the_track():
-    _, segments = twice_along_one_track()
+    _, segments = twice_along_a_track()
     stack, track = Stack.of(segments), tracks(segments)
     part = selection.folds(stack, 0)
     for number in np.unique(part):

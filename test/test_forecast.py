@@ -13,9 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform, align, rotation
 from sfa_localization.metric import drive_check, selection
-from sfa_localization.metric.forecast import (
-    REACH_M,
-)
+from sfa_localization.metric.forecast import REACH_M
 from sfa_localization.metric.learning import learn_metric
 from sfa_localization.metric.segments import cut
 from sfa_localization.metric.selection import folds
@@ -25,18 +23,18 @@ from sfa_localization.metric.stack import Stack
 CONFIG = MetricConfig(slow_features=12)
 DRIVES = {
     'straight legs': criss_cross(30, half=(5.0, 5.0), seed=1, shortest=5.0),
-    'other legs': criss_cross(40, half=(6.0, 4.0), seed=2, shortest=5.0),
     'wandering': meander(250.0, seed=3),
     'lanes along and across': (grid(10.0, 1.0, 9), (-5.0, -5.0, 0.0)),
 }
 
 
-def trained(name, noise=0.05):
-    """True poses at the images, segments, features and what is learnt of a noisy drive."""
+@cache
+def trained(name):
+    """True poses at the images, segments, features and the map of a noisy drive."""
     twists, start = DRIVES[name]
     run = drive(twists, start=start, bias=1.4e-3, yaw_noise=0.01, speed_noise=0.03, seed=5)
     segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
-    features = garden_features(run.poses[:, :2], noise=noise)
+    features = garden_features(run.poses[:, :2], noise=0.05)
     with pytest.MonkeyPatch.context() as patch:
         quick_and_tolerant(patch)
         return run.poses, segments, features, learn_metric(features, segments, CONFIG)
@@ -48,20 +46,14 @@ def quick_and_tolerant(patch):
     patch.setattr(drive_check, 'ANGLE_STD_MAX_DEG', 180.0)
 
 
-@cache
-def legs():
-    return trained('straight legs')
-
-
-def between(known, count=1500):
-    """Places (N, 2) drawn evenly in the middle of the known ones, and near one of them."""
-    low, high = np.quantile(known, [0.05, 0.95], axis=0)
+def between(trained, count=1500):
+    """Places (N, 2) drawn evenly in the middle of the trained ones, and near to any of them."""
+    low, high = np.quantile(trained, [0.05, 0.95], axis=0)
     places = np.random.default_rng(6).uniform(low, high, (count, 2))
-    near = [np.hypot(*(known - place).T).min() < REACH_M for place in places]
+    near = [np.hypot(*(trained - place).T).min() < REACH_M for place in places]
     return places[near]
 
 
-@cache
 def judged(name):
     """Forecast over true error of single images on paths between, and share in the ellipse."""
     poses, _, features, result = trained(name)
@@ -83,7 +75,7 @@ def test_forecasts_and_ellipses_are_right():
 
 def test_it_is_worst_where_the_images_mislead(monkeypatch):
     quick_and_tolerant(monkeypatch)
-    poses, segments, features, _ = legs()
+    poses, segments, features, _ = trained('straight legs')
     misled = poses[:, 0] > 2.5
     noise = 0.6 * np.random.default_rng(1).standard_normal(features.shape)
     result = learn_metric(features + np.where(misled, 1.0, 0.0)[:, None] * noise, segments, CONFIG)
@@ -115,7 +107,7 @@ def test_a_map_of_weak_images_keeps_the_shape_of_its_odometry_and_says_how_weak(
 
 @pytest.mark.parametrize('length', [0.1, 1e4])
 def test_a_drive_shorter_than_a_held_out_stretch_is_held_out_in_parts(length, monkeypatch):
-    _, segments, features, usual = legs()
+    _, segments, features, usual = trained('straight legs')
     quick_and_tolerant(monkeypatch)
     monkeypatch.setattr(selection, 'HELD_OUT_LENGTH_M', length)
     stack = Stack.of(segments)

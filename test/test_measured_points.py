@@ -71,27 +71,25 @@ def counted(places, seed=0, std=0.02):
 
 def test_points_apart_give_heading_and_scale_as_well_as_they_say():
     for measured in (CORNERS, CORNERS[:2], np.array([-6, 0, 7])):  # these are on a line
-        found = [settled(measured, counted(measured, seed)) for seed in range(50)]
-        assert all(one.used.all() and one.turned for one in found)
-        errors = [(one.scale * WHEELS - 1) / one.scale_std for one in found]
+        results = [settled(measured, counted(measured, seed)) for seed in range(50)]
+        assert all(result.used.all() and result.turned for result in results)
+        errors = [(result.scale * WHEELS - 1) / result.scale_std for result in results]
         assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.3
 
 
 @pytest.mark.parametrize('wrong', range(5))
-def test_one_wrong_point_of_five_is_found(wrong):
+def test_a_wrong_point_of_five_is_an_outlier(wrong):
     for seed in range(20):
-        away = 2.0 * np.exp(1j * seed)
-        measured = CORNERS + away * (np.arange(5) == wrong)
-        found = settled(measured, counted(CORNERS, seed))
-        assert found.used.tolist() == [k != wrong for k in range(5)]
-        assert found.scale * WHEELS == pytest.approx(1.0, abs=4 * found.scale_std)
+        measured = CORNERS + 2.0 * np.exp(1j * seed) * (np.arange(5) == wrong)
+        result = settled(measured, counted(CORNERS, seed))
+        assert result.used.tolist() == [k != wrong for k in range(5)]
+        assert result.scale * WHEELS == pytest.approx(1.0, abs=4 * result.scale_std)
 
 
-def test_one_point_and_two_at_one_place_fix_the_place_only():
+def test_points_at_the_same_place_fix_the_place_only():
     for measured in (CORNERS[:1], CORNERS[[0, 0]], np.array([0.0, 0.02])):
-        found = settled(measured, counted(measured))
-        assert found.used.all() and not found.turned
-        assert found.scale == 1.0
+        result = settled(measured, counted(measured))
+        assert result.used.all() and not result.turned and result.scale == 1.0
 
 
 def test_points_that_cannot_be_of_the_drive_are_an_error_that_says_why():
@@ -108,10 +106,9 @@ def test_points_that_cannot_be_of_the_drive_are_an_error_that_says_why():
 
 
 def test_a_drive_that_bends_by_more_than_it_claims_keeps_most_points():
-    bent = counted(CORNERS) + 0.02 * counted(CORNERS) ** 2
-    found = settled(CORNERS, bent)
-    assert found.used.sum() >= 3
-    assert found.scale_std > settled(CORNERS, counted(CORNERS)).scale_std
+    result = settled(CORNERS, counted(CORNERS) + 0.02 * counted(CORNERS) ** 2)
+    assert result.used.sum() >= 3
+    assert result.scale_std > settled(CORNERS, counted(CORNERS)).scale_std
 
 
 HALF_M = 6.0  # of the garden
@@ -173,13 +170,13 @@ def errors(rows=(), wrong=None):
     _, result = learned(rows, wrong)
     images, places = result.images, result.poses[:, :2]
     true = world()[1].poses[images, :2] @ [1, 1j]
-    own = places @ [1, 1j]
-    frame = np.column_stack([own, np.ones(len(own))])
+    places = places @ [1, 1j]
+    frame = np.column_stack([places, np.ones(len(places))])
     best = np.linalg.lstsq(frame, true, rcond=None)[0]
-    return np.abs(own - true).mean(), np.abs(frame @ best - true).mean(), abs(best[0])
+    return np.abs(places - true).mean(), np.abs(frame @ best - true).mean(), abs(best[0])
 
 
-def far_apart():
+def corners():
     """Images at the ends of the garden, and one amid it."""
     places = world()[1].poses[:, :2]
     ends = [int(np.argmax(places @ way)) for way in ([1, 1], [-1, -1], [1, -1], [-1, 1])]
@@ -187,7 +184,7 @@ def far_apart():
 
 
 def test_a_map_lies_in_the_coordinates_of_its_points():
-    rows = far_apart()
+    rows = corners()
     before, rest, _ = errors()
     assert before > 1.0
     for chosen, wrong in ((rows[:2], None), (rows, None), (rows, 2)):
@@ -201,17 +198,17 @@ def test_a_map_lies_in_the_coordinates_of_its_points():
 
 
 def test_the_wrong_point_is_named_and_missed_by_what_it_is_wrong():
-    segments, result = learned(far_apart(), 2)
-    quality = segments.points.quality(result.points)
-    assert [one['used'] for one in quality['points']] == [True, True, False, True, True]
-    assert quality['points'][2]['miss_m'] == pytest.approx(2.0, abs=0.1)
-    assert max(one['miss_m'] for one in quality['points'] if one['used']) < 0.1
-    (said,) = segments.points.warnings(result.points)
-    assert said.startswith('point 2: ')
+    segments, result = learned(corners(), 2)
+    figures = segments.points.quality(result.points)['points']
+    assert [point['used'] for point in figures] == [True, True, False, True, True]
+    assert figures[2]['miss_m'] == pytest.approx(2.0, abs=0.1)
+    assert max(point['miss_m'] for point in figures if point['used']) < 0.1
+    (warning,) = segments.points.warnings(result.points)
+    assert warning.startswith('point 2: ')
 
 
-def test_one_point_moves_the_map_of_the_odometry():
-    plain, (segments, result) = learned()[1], learned(far_apart()[:1])
+def test_a_single_point_moves_the_map_of_the_odometry():
+    plain, (segments, result) = learned()[1], learned(corners()[:1])
     turned = align(plain.poses[:, :2], result.poses[:, :2])
     assert turned.yaw_rad == pytest.approx(0.0, abs=1e-3)
     assert np.abs(turned.apply(plain.poses[:, :2]) - result.poses[:, :2]).max() < 1e-2
@@ -251,18 +248,17 @@ def standing():
     return drive(np.vstack(parts)).odometry
 
 
-def test_stops_are_found_and_named_by_their_number(tmp_path):
-    odometry = standing()
-    found = (stops(odometry) - odometry.stamps_ns[0]) * 1e-9
-    assert found == pytest.approx(np.array([[0.0, 3.0], [8.0 + 1 / 0.6, 11.0 + 1 / 0.6]]), abs=0.1)
-    file = tmp_path / 'points.csv'
+def test_stops_are_named_by_their_number(tmp_path):
+    odometry, file = standing(), tmp_path / 'points.csv'
+    seconds = (stops(odometry) - odometry.stamps_ns[0]) * 1e-9
+    assert seconds == pytest.approx(
+        np.array([[0.0, 3.0], [8.0 + 1 / 0.6, 11.0 + 1 / 0.6]]), abs=0.1
+    )
     file.write_text('stamp_s,x_m,y_m,std_m\n# a mark\nstop, 2, 4.0, 1.5\n12.5, 3, -1, 0.05\n')
     read = read_points(file, odometry)
     assert read.names == ('stop 2', 'point of 12.5 s')
-    assert read.stamps_ns[0] == pytest.approx(stops(odometry)[1].mean(), abs=1)
-    assert read.stamps_ns[1] == 12_500_000_000
-    assert read.places.tolist() == [4 + 1.5j, 3 - 1j]
-    assert read.std.tolist() == [0.02, 0.05]
+    assert read.stamps_ns == pytest.approx([stops(odometry)[1].mean(), 12_500_000_000], abs=1)
+    assert read.places.tolist() == [4 + 1.5j, 3 - 1j] and read.std.tolist() == [0.02, 0.05]
 
 
 @pytest.mark.parametrize(
@@ -316,8 +312,8 @@ def test_points_clicked_on_the_map_of_a_lidar_give_a_model_its_coordinates(tmp_p
     topics = replace(SMALL_RECIPE.topics, points_topic='/clicked_point')
     trained = train([tmp_path / 'drive'], tmp_path / 'm.npz', replace(SMALL_RECIPE, topics=topics))
     model = PlaceModel.load(tmp_path / 'm.npz')
-    found = np.array([model.locate(image).position for image in images[::5]])
-    assert np.hypot(*(found - in_lidar_map[::5]).T).mean() < 0.15
+    positions = np.array([model.locate(image).position for image in images[::5]])
+    assert np.hypot(*(positions - in_lidar_map[::5]).T).mean() < 0.15
     assert model.rig.wheel_scale.value * WHEELS == pytest.approx(
         1.0, abs=3 * model.rig.wheel_scale.std
     )

@@ -66,8 +66,8 @@ def located(poses, yaw_error=0.0, yaw_variance=1e-4):
     """Positions of unseen images by their turned maps, covariances, and what the yaw adds."""
     _, turned, result = world()
     given = poses[:, 2] + yaw_error, np.full(len(poses), yaw_variance)
-    places, own, by_yaw = turned.predict(result.map, spectrum(maps_at(poses, seed=7)), *given)
-    return places, own + by_yaw, by_yaw
+    places, by_map, by_yaw = turned.predict(result.map, spectrum(maps_at(poses, seed=7)), *given)
+    return places, by_map + by_yaw, by_yaw
 
 
 def mean_error(places, poses):
@@ -76,8 +76,8 @@ def mean_error(places, poses):
 
 def share_inside(estimate, places):
     """Share of true places inside the 95 % ellipses."""
-    apart = estimate[0] - places
-    squared = np.einsum('ti,tij,tj->t', apart, np.linalg.inv(estimate[1]), apart)
+    off = estimate[0] - places
+    squared = np.einsum('ti,tij,tj->t', off, np.linalg.inv(estimate[1]), off)
     return float((squared < chi2.ppf(0.95, 2)).mean())
 
 
@@ -93,16 +93,13 @@ def test_a_roll_of_the_columns_is_a_turn_of_the_robot(sign, steps):
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
 def test_features_do_not_depend_on_the_heading_between_columns(sign):
     poses = unseen(20)
-    turned = replace_yaw(poses, np.random.default_rng(1).uniform(-9, 9, 20))
+    yaw = np.random.default_rng(1).uniform(-9, 9, 20)
+    turned = np.column_stack([poses[:, :2], yaw])
     features = [
         turned_back(spectrum(maps_at(p, sign, noise=0.0)), p[:, 2], sign) for p in (poses, turned)
     ]
     np.testing.assert_allclose(*features, atol=2e-5)
     assert np.abs(features[0]).max() > 0.5
-
-
-def replace_yaw(poses, yaw):
-    return np.column_stack([poses[:, :2], yaw])
 
 
 def test_principal_components_hold_what_the_vectors_span():
@@ -115,14 +112,11 @@ def test_principal_components_hold_what_the_vectors_span():
     np.testing.assert_allclose(turned.axes.T @ turned.axes, np.eye(4), atol=1e-4)
     assert np.all(np.diff(features.var(0)) < 0)
     np.testing.assert_allclose(features @ turned.axes.T + turned.mean, spanned, atol=1e-3)
-
-
-def test_maps_that_never_change_show_no_place():
     with pytest.raises(DataError, match='equal'):
         TurnedMaps.fit(np.ones((50, 8, 1), np.complex64), np.zeros(50), 1.0)
 
 
-def test_unseen_places_are_found_better_than_by_the_slow_features():
+def test_unseen_places_are_located_better_than_by_the_slow_features():
     poses = unseen()
     slow = worlds.garden_features(poses[:, :2], noise=NOISE, seed=6)
     first = world()[0].map.predict(slow)[0]

@@ -19,12 +19,10 @@ from sfa_localization.data.geometry import (
     invert,
 )
 from sfa_localization.data.statistics import evenly
+from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.map_fit import MapFit
 from sfa_localization.metric.pose_graph import SAMPLED
 from sfa_localization.metric.saved_map import MetricMap
-
-# Error of odometry over the distance driven.
-_DRIFT = 0.1
 
 
 def plane(points: Complex) -> Array:
@@ -73,18 +71,33 @@ def map_frame(fit: MapFit) -> RigidTransform:
 
 
 def _start_frame(fit: MapFit) -> RigidTransform:
-    """By the odometry at the start of the first run, which has drifted little there, or by the pose
-    that the run is to have."""
-    segments, stack, links = fit.problem.segments, fit.stack, fit.problem.links
-    pose = fit.problem.config.start_pose
-    unbroken = np.append(True, np.cumprod(links.at == np.arange(len(links.at))).astype(bool))
-    rows = np.flatnonzero(stack.owner < unbroken.sum())
-    x, y, yaw = stack.starts[stack.owner[rows]].T
-    driven = x + 1j * y + np.exp(1j * yaw) * stack.path[rows]
-    weights = 1.0 / ((_DRIFT * np.cumsum(stack.steps)[rows]) ** 2 + fit.variance)
+    """By the odometry at the start of the first run, each image weighted by how little the odometry
+    can have drifted until then, or by the pose that the run is to have."""
+    segments, stack, pose = fit.problem.segments, fit.stack, fit.problem.config.start_pose
+    starts, variances = _odometry(fit)
+    rows = np.flatnonzero(stack.owner < len(starts))
+    x, y, yaw = starts[stack.owner[rows]].T
+    driven = x + 1j * y + np.exp(1j * yaw) * stack.corrected(fit.graph.poses.bias)[rows]
+    weights = 1.0 / (variances[stack.owner[rows]] + fit.variance)
     turn, shift = align_complex(fit.places[rows], driven, weights)
     frame = np.array([shift.real, shift.imag, float(np.angle(turn))])
     if pose:
         start = segments.mount.base(segments[0].start[None], 0)[0]
         frame = compose(compose(np.array(pose), invert(start)), frame)
     return RigidTransform(*frame.tolist())
+
+
+def _odometry(fit: MapFit) -> tuple[Array, Array]:
+    """Poses (n, 3) of the first segments by odometry without the biases, up to the first break, and
+    the variances (n,) of their places."""
+    links, stack = fit.problem.links, fit.stack
+    unbroken = np.cumprod(links.at == np.arange(len(links.at))).astype(bool)
+    bias = fit.graph.poses.bias[stack.period[links.at]]
+    turned = (links.turn_rad - bias * links.turn_time_s)[unbroken]
+    moved = (links.displacement - bias * links.displacement_drift)[unbroken]
+    x, y, yaw = stack.starts[0]
+    yaw = yaw + summed(turned)
+    place = x + 1j * y + summed(np.exp(1j * yaw[:-1]) * moved)
+    by_turns = summed(links.turn_variance[unbroken])[:-1] * np.abs(moved) ** 2
+    variances = summed(links.displacement_variance[unbroken] + by_turns)
+    return np.column_stack([plane(place), yaw]), variances
