@@ -176,10 +176,10 @@ def test_images_show_the_loss_forward_and_backward(v):
 def test_a_map_that_grew_or_shrank_shows_another_loss_but_no_other_scale():
     before = Way(1.0, 0.1)
     for map_scale in (0.95, 1.0, 1.05):
-        shown = way(0.15, before, map_scale)
-        assert shown.loss / shown.scale == pytest.approx(0.15, abs=0.02)
+        by_map = way(0.15, before, map_scale)
+        assert by_map.loss / by_map.scale == pytest.approx(0.15, abs=0.02)
         # A smaller loss with the same scale as the larger one with more way.
-        assert 1.0 < shown.scale == pytest.approx(way(0.15, before).scale)
+        assert 1.0 < by_map.scale == pytest.approx(way(0.15, before).scale)
 
 
 def test_where_images_show_no_loss_nothing_is_corrected():
