@@ -99,7 +99,7 @@ def regress(
     parts = (weighted[:, part].reshape(len(spectra), -1).view(np.float32) for part in channels)
     products = np.stack([part @ part.T for part in parts]).astype(float)
     basis = _Basis.of(products[:, count, :count].sum(axis=0), drives, places)
-    # The image keeps the same share of its differences as of its likeness to the mean.
+    # Differences shrink in another light as the likeness of the image to the mean does.
     mean = products[:, :count, :count] @ basis.mean
     likeness = products[:, count, :count] @ basis.mean
     gains = np.maximum(likeness / np.maximum(mean @ basis.mean, 1e-12), _LEAST_GAIN)
@@ -128,8 +128,8 @@ def _root_weights(frequencies: int, columns: int) -> Texture:
 @dataclass(frozen=True, slots=True)
 class _Basis:
     """What N keyframes are compared with: the shares `mean` (N,) of the mean that is most like the
-    image, and `centered` (N, N), which takes the likest mean of its drive from each keyframe;
-    `offsets` (N, 2) m are their places, centered so, and `weight` (N,) of sum 1 their weights.
+    image, and `centered` (N, N), which subtracts from each keyframe the likest mean of its drive;
+    their `places` (N, 2) m, and their `weight` (N,) in the regression, of sum 1.
     """
 
     mean: Array
