@@ -19,10 +19,8 @@ from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import SetParameters
 from ros_bench import DEADLINE_S, start_process, until
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import String
 
 from sfa_localization.nodes.entry import CANNOT_START, DIED
-from sfa_localization.nodes.lifecycle import latched_qos
 
 pytestmark = pytest.mark.ros
 RUN = 'import sys; from sfa_localization.nodes import entry; sys.exit(entry.{}())'
@@ -52,18 +50,6 @@ def ended(process):
     """Wait until a process ends, perhaps beside others: its exit code, and what it printed."""
     _, text = process.communicate(timeout=3 * DEADLINE_S)
     return process.returncode, text
-
-
-def test_a_signal_ends_the_node_with_exit_code_0(bench, start):
-    """Active by SIGINT, unconfigured by SIGTERM."""
-    heard, active = [], start('ekf_node')
-    unconfigured = start('ekf_node', '-p', 'autostart:=false', '-r', '__node:=other')
-    bench.node.create_subscription(String, 'ekf/state', heard.append, latched_qos())
-    assert until(lambda: heard and 'other' in bench.node.get_node_names())
-    for process, number in ((active, signal.SIGINT), (unconfigured, signal.SIGTERM)):
-        process.send_signal(number)
-        code, text = ended(process)
-        assert code == 0 and 'Traceback' not in text, text
 
 
 def test_what_rclpy_cannot_handle_itself_ends_nothing(bench, start):
