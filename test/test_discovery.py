@@ -102,11 +102,12 @@ def test_the_output_of_another_localizer_is_no_sensor(bench, kind, other, topics
 def test_without_images_the_diagnostics_name_those_that_there_are(bench, monkeypatch):
     """Of both types: another `image_transport` may be all that is wrong."""
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
-    for kind, name in ((Image, '/a'), (Image, '/b'), (CompressedImage, '/c')):
+    both = ((Image, '/a'), (Image, '/b'), (CompressedImage, '/c'), (CompressedImage, '/d'))
+    for kind, name in both:
         bench.node.create_publisher(kind, name, 10)
     bench.node.create_subscription(Image, 'panorama', lambda _: None, 1)
     words = [f'/{name} (sensor_msgs/msg/Image)' for name in 'ab']
-    words.append('/c (sensor_msgs/msg/CompressedImage)')
+    words += [f'/{name} (sensor_msgs/msg/CompressedImage)' for name in 'cd']
     camera = {'silence_timeout': 0.05, 'image_transport': 'compressed'}
     for kind, settings in ((SfaNode, {'model': 'a.npz'}), (OmnicamNode, camera)):
         node = bench.run(kind, **settings)
