@@ -62,23 +62,6 @@ def start_process(*words, **options):
     return subprocess.Popen([sys.executable, *map(str, words)], env=environment, **options)
 
 
-def start_node(name, *parameters, namespace='/', **options):
-    """The process of a node."""
-    words = [word for value in parameters for word in ('-p', value)]
-    command = '-m', 'sfa_localization', name, '--ros-args', '-r', f'__ns:={namespace}'
-    return start_process(*command, *words, **options)
-
-
-def end_process(process):
-    """Ask it to end, and make it where it does not."""
-    process.terminate()
-    try:
-        process.wait(DEADLINE_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-
-
 def end_node(node):
     """End a node as `run_node` does."""
     node.teardown()

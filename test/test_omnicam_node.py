@@ -7,26 +7,19 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 from sfa_localization.camera import watch
 from sfa_localization.camera.calibration_files import calibration_text
 from sfa_localization.camera.encodings import decode_compressed
 from sfa_localization.camera.leveling import leveled
 from sfa_localization.camera.panorama import Unwrapper
-from sfa_localization.camera.settings import (
-    CameraConfig,
-    CaptureConfig,
-    LensCalibration,
-    PanoramaConfig,
-)
-from sfa_localization.config import load_settings, write_config
+from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Quaternion
-from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from ros_bench import until
 from sensor_msgs.msg import CompressedImage, Image, Imu
@@ -41,13 +34,11 @@ from sfa_localization.nodes.conversions import (
 )
 from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.nodes.omnicam_node import OmnicamNode
-from sfa_localization.nodes.settings import OmnicamNodeConfig
 
 pytestmark = pytest.mark.ros
 PANORAMA = PanoramaConfig(width=120, height=12)
 SMALL = {'width': 120, 'height': 12, 'camera_model': 'mirror'}
 MIRROR = CameraConfig(camera_model='mirror')
-GROUPS = (OmnicamNodeConfig, CaptureConfig, CameraConfig, PanoramaConfig)
 STAMP_NS = 12_000_000_034
 
 
@@ -215,24 +206,6 @@ def test_a_remap_of_the_base_topic_holds_for_its_transports(bench, rules, heard)
     bench.run(OmnicamNode, image_transport='compressed', options=with_rules(*rules), **SMALL)
     bench.node.create_subscription(CompressedImage, '/panorama/compressed', lambda _: None, 1)
     assert until(lambda: bench.node.count_subscribers(heard) == 1)
-
-
-def test_what_ros2_param_dump_writes_can_be_loaded_again(bench, tmp_path):
-    def dumped(node):
-        given = node.get_parameters(node.list_parameters([], 0).names)
-        return {each.name: parameter_value_to_python(each.get_parameter_value()) for each in given}
-
-    path = tmp_path / 'omnicam_node.yaml'
-    write_config(path, {'omnicam_node': {'source_rate': 7.5}})
-    options = {'cli_args': ['--ros-args', '--params-file', str(path)]}
-    node = bench.run(OmnicamNode, start=False, options=options)
-    first, settings = dumped(node), [node.settings(kind) for kind in GROUPS]
-    assert first['blind_sectors'] == [] and first['source_rate'] == 7.5
-    bench.end(node)
-    path.write_text(yaml.safe_dump({'/omnicam_node': {'ros__parameters': first}}))
-    node = bench.run(OmnicamNode, start=False, options=options)
-    assert [node.settings(kind) for kind in GROUPS] == settings and dumped(node) == first
-    assert [load_settings(path, 'omnicam_node', kind) for kind in GROUPS] == settings
 
 
 def test_a_silent_camera_shows_in_diagnostics(bench, monkeypatch):

@@ -37,34 +37,22 @@ def config(**values):
     return CaptureConfig(**{'silence_timeout': 0.1, **values})
 
 
-class Script:
-    """Captures that play given steps: a level is a picture, an exception is raised, an Event blocks
-    until it is set.
-    """
+def camera(steps, live=True):
+    """A source of pictures of these levels; an exception among them is raised."""
 
-    def __init__(self, *captures, live=True):
-        self.captures, self.live = list(captures), live
-        self.opened = self.closed = 0
+    def play():
+        for step in steps:
+            time.sleep(0.001)
+            if isinstance(step, Exception):
+                raise step
+            yield picture(step)
 
-    def __call__(self):
-        self.opened += 1
-        steps = self.captures.pop(0) if len(self.captures) > 1 else self.captures[0]
-        if isinstance(steps, Exception):
-            raise steps
-        return Source(self.live, self.play(steps))
+    return Source(live, play())
 
-    def play(self, steps):
-        try:
-            for step in steps:
-                time.sleep(0.001)
-                if isinstance(step, Exception):
-                    raise step
-                if isinstance(step, threading.Event):
-                    step.wait(PATIENCE_S)
-                    step = 255
-                yield picture(step)
-        finally:
-            self.closed += 1
+
+def opening(*results):
+    """Opens one source after the other; exceptions are raised."""
+    return mock.Mock(side_effect=results)
 
 
 @pytest.fixture
@@ -100,81 +88,79 @@ def arrived(received, count):
     return [received.get(timeout=PATIENCE_S) for _ in range(count)]
 
 
-def ended(feed):
-    return lambda: feed.status().state == 'ended'
-
-
-def test_pictures_arrive_in_order_until_the_end(run_feed):
-    """Equal ones of a file are no fault."""
-    script = Script([1, 2, *[7] * 60], live=False)
-    feed, received = run_feed(script)
+def test_files_wait_until_they_are_wanted_and_arrive_in_order_until_the_end(run_feed):
+    """Equal ones are no fault."""
+    wanted, open_ = threading.Event(), opening(camera([1, 2, *[7] * 60], live=False))
+    feed, received = run_feed(open_, wanted=wanted.is_set)
+    wait_for(lambda: open_.called)
+    assert received.empty()
+    wanted.set()
     assert arrived(received, 62) == [1, 2, *[7] * 60]
-    wait_for(lambda: feed.check().state == 'ended' and script.closed == 1)
-    assert script.opened == 1 and feed.status().lost == 0
+    wait_for(lambda: feed.check().state == 'ended')
+    assert open_.call_count == 1 and feed.status().lost == 0
 
 
 def test_a_disconnected_camera_is_opened_again(run_feed):
-    script = Script([1, 2, CameraError('unplugged')], CameraError('not there'), [3, 4, 5])
-    feed, received = run_feed(script)
+    unplugged = camera([1, 2, CameraError('unplugged')])
+    open_ = opening(unplugged, CameraError('not there'), camera([3, 4, 5]))
+    feed, received = run_feed(open_)
     assert arrived(received, 5) == [1, 2, 3, 4, 5]
-    assert script.opened == 3 and feed.status().lost == 2
-    feed, _ = run_feed(Script(CameraError('not there')))
+    assert open_.call_count == 3 and feed.status().lost == 2
+    feed, _ = run_feed(mock.Mock(side_effect=CameraError('not there')))
     wait_for(lambda: feed.status().state == 'lost')
     assert feed.status().problem == 'not there'
 
 
 def test_a_silent_camera_is_abandoned_and_opened_again(run_feed):
-    released = threading.Event()
-    script = Script([1, released], [2, 3])
-    feed, received = run_feed(script)
+    released, closed = threading.Event(), threading.Event()
+
+    def hanging():
+        try:
+            yield picture(1)
+            released.wait(PATIENCE_S)
+            yield picture(255)
+        finally:
+            closed.set()
+
+    open_ = opening(Source(True, hanging()), camera([2, 3]))
+    feed, received = run_feed(open_)
     assert received.get(timeout=PATIENCE_S) == 1
-    wait_for(lambda: script.opened == 2, feed)
+    wait_for(lambda: open_.call_count == 2, feed)
     assert arrived(received, 2) == [2, 3]
     assert feed.status().lost == 1
     released.set()  # the read that hung returns a picture, which nobody wants any more
-    wait_for(lambda: script.closed == 2)
-    assert received.empty()
+    assert closed.wait(PATIENCE_S) and received.empty()
 
 
 def test_a_frozen_camera_is_opened_again_until_it_moves(run_feed):
-    script = Script(chain([1], repeat(2)), repeat(2), repeat(2), [3, 4, 5])
-    feed, received = run_feed(script)
-    wait_for(lambda: script.opened == 2)
+    frozen = camera(chain([1], repeat(2))), camera(repeat(2)), camera(repeat(2))
+    open_ = opening(*frozen, camera([3, 4, 5]))
+    feed, received = run_feed(open_)
+    wait_for(lambda: open_.call_count == 2)
     assert 'repeated' in feed.status().problem or feed.status().state == 'lost'
-    wait_for(ended(feed))
+    wait_for(lambda: feed.status().state == 'ended')
     assert list(received.queue)[-3:] == [3, 4, 5]
-    assert script.opened == 4 and feed.status().lost == 3
+    assert open_.call_count == 4 and feed.status().lost == 3
 
 
 def test_a_defect_in_the_thread_is_reported_and_the_source_opened_again(run_feed):
-    rejected = []
-    script = Script([1, ZeroDivisionError()], [2, ZeroDivisionError()], [3], live=False)
-    feed, received = run_feed(script, rejected.append)
+    rejected, defect = [], ZeroDivisionError()
+    files = (camera(steps, live=False) for steps in ([1, defect], [2, defect], [3]))
+    feed, received = run_feed(opening(*files), rejected.append)
     assert arrived(received, 3) == [1, 2, 3]
-    wait_for(ended(feed))
+    wait_for(lambda: feed.status().state == 'ended')
     assert feed.status().lost == 2
     assert rejected == ['internal error: ZeroDivisionError'] * 2
 
 
-def test_files_wait_until_they_are_wanted(run_feed):
-    wanted, script = threading.Event(), Script([1, 2], live=False)
-    feed, received = run_feed(script, wanted=wanted.is_set)
-    wait_for(lambda: script.opened == 1)
-    assert received.empty()
-    wanted.set()
-    wait_for(ended(feed))
-    assert received.qsize() == 2
-
-
 def test_nothing_is_delivered_after_stop(run_feed):
-    script = Script(range(10**5))
-    feed, received = run_feed(script)
+    open_ = opening(camera(range(10**5)))
+    feed, received = run_feed(open_)
     received.get(timeout=PATIENCE_S)
     feed.stop()
-    assert script.closed == 1
     count = received.qsize()
     feed.check()
-    assert script.opened == 1 and received.qsize() == count
+    assert open_.call_count == 1 and received.qsize() == count
 
 
 def test_video(tmp_path, run_feed):
@@ -188,7 +174,7 @@ def test_video(tmp_path, run_feed):
     values = {'source': 'video', 'source_path': path, 'source_rate': 500.0}
     feed, received = run_feed(opener(config(**values)), **values)
     assert arrived(received, 3) == pytest.approx([10, 100, 200], abs=3)
-    wait_for(ended(feed))
+    wait_for(lambda: feed.status().state == 'ended')
 
 
 def test_sources_that_are_not_there_are_named(tmp_path, monkeypatch):
