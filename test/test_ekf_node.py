@@ -30,7 +30,6 @@ from sfa_localization.data.geometry import compose
 from sfa_localization.data.messages import read_planar, read_stamp
 from sfa_localization.data.rig import Rig
 from sfa_localization.fusion.pose_filter import PoseFilter
-from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes import ekf_node, lifecycle
 from sfa_localization.nodes.ekf_node import EkfNode
@@ -79,12 +78,10 @@ def test_outputs_agree_and_have_the_stamps_of_inputs(bench, monkeypatch):
     assert until(lambda: len(poses) == len(drive.pictures))
     assert stamps_of(fused) == stamps_of(transforms) == drive.stamps_ns.tolist()
     assert stamps_of(poses) == drive.stamps_ns[drive.pictures].tolist()
-    # tf2 interpolates between the transforms that it holds.
-    held = dict(pair for message in sent for pair in json.loads(message.data))
-    times, told = np.array([*sorted(held)]), np.array([held[stamp] for stamp in sorted(held)])
-    asked = drive.stamps_ns - START_NS
-    columns = *told.T[:2], np.unwrap(told[:, 2])
-    found = np.column_stack([np.interp(asked, times - START_NS, column) for column in columns])
+    held = {}
+    for stamp_ns, pose in (pair for message in sent for pair in json.loads(message.data)):
+        held.setdefault(stamp_ns, pose)  # tf2 rejects a stamp that it has already
+    found = np.array([held[stamp_ns] for stamp_ns in drive.stamps_ns.tolist()])
     assert np.ptp(found, axis=0)[:2].max() > 0.1, 'nothing was corrected'
     for lookup, reckoned, message, stamped in zip(
         found, drive.reckoned, fused, transforms, strict=True
@@ -92,7 +89,7 @@ def test_outputs_agree_and_have_the_stamps_of_inputs(bench, monkeypatch):
         assert near(compose(lookup, reckoned), pose_of(message), 1e-6)
         transform = stamped.transform
         assert near(read_planar(transform.translation, transform.rotation), lookup, 1e-9)
-    assert times[-1] - drive.stamps_ns[-1] == 100_000_500
+    assert max(held) - drive.stamps_ns[-1] == 100_000_500
     last = node.filter.at(read_stamp(poses[-1].header.stamp))
     _, pose, covariance = convert.read_pose(poses[-1])
     assert near(pose, last.pose, 1e-9) and np.allclose(covariance, last.pose_covariance, rtol=0.2)
@@ -147,13 +144,6 @@ def test_the_state_is_on_diagnostics_for_programs(bench):
     values = told()
     assert float(values['/odom: rate [Hz]']) > 0 and 'position std [m]' in values
     assert float(values['/odom: latency p99 [ms]']) >= float(values['/odom: latency p50 [ms]']) > 0
-    for expected, settings in (
-        ((DiagnosticStatus.WARN, 'DEGRADED'), FilterConfig(degraded_std=1e-3)),
-        ((DiagnosticStatus.ERROR, 'LOST'), FilterConfig(degraded_std=1e-3, lost_std=1e-3)),
-    ):
-        node.filter.reconfigure(settings)
-        level, text, values = node.health()
-        assert (level, values['state']) == expected and 'position known to' in text
 
 
 def test_initialpose_and_set_pose_set_the_pose(bench):
@@ -199,8 +189,7 @@ MALFORMED = [
     ('odom', f'{TWIST}.linear.x', math.nan), ('odom', f'{TWIST}.angular.z', 1e200),
     ('odom', TURNED, Quaternion(w=0.0)), ('odom', 'header.stamp', Stamp()),
     ('odom', 'header.stamp.nanosec', 2_000_000_000),
-    (SEEN, f'{PLACED}.x', math.inf), (SEEN, f'{TURNED}.w', math.nan),
-    (SEEN, 'pose.covariance', np.full(36, math.nan)), (SEEN, 'pose.covariance', -np.ones(36)),
+    (SEEN, f'{PLACED}.x', math.inf), (SEEN, 'pose.covariance', -np.ones(36)),
     (SEEN, 'header.frame_id', 'elsewhere'), (SEEN, 'header.stamp.sec', 2_000_000_000),
 ]  # fmt: skip
 
@@ -234,7 +223,8 @@ def test_silence_is_reported_without_any_clock_moving(bench):
     for told in ('nothing on /odom', f'nothing on /{SEEN}', 'LOST: position known to'):
         assert until(lambda t=told: any(t in state.data for state in states)), told
     assert node.filter.status.level.name != 'LOST', 'by the stamps of the messages it is not'
-    assert float(node.health()[2]['position std [m]']) > 0.5
+    level, _, values = node.health()
+    assert level == DiagnosticStatus.ERROR and float(values['position std [m]']) > 0.5
     play(bench, node, drive, part(drive, 2.0))
     assert node.status().level.name != 'LOST'
     gone = f'nobody publishes on /{SEEN}'

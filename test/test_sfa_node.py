@@ -76,8 +76,8 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
     bench.publish('panorama', message())
     assert until(lambda: slow and features and poses and uncertain)
     assert list(slow[0].data) == pytest.approx(PLACE, abs=1e-3), 'as the reader says'
-    p = features[0].pose.position
-    assert (p.x, p.y, p.z) == tuple(slow[0].data)
+    position = features[0].pose.position
+    assert [position.x, position.y, position.z] == list(slow[0].data)
     assert features[0].header.frame_id == 'slow_feature_space'
     for pose, stamped in ((poses[0].pose, poses[0]), (uncertain[0].pose.pose, uncertain[0])):
         assert read_stamp(stamped.header.stamp) == 5_000_000_001
