@@ -25,7 +25,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, Imu
 
 from sfa_localization.commands import bag_player
-from sfa_localization.commands.bag_player import SETTLED_S, message_class, play, qos_profile
+from sfa_localization.commands.bag_player import SETTLED_S, play, qos_profile
 from sfa_localization.commands.play import PlayConfig
 from sfa_localization.data.messages import read_stamp
 
@@ -99,20 +99,16 @@ def test_clock_and_messages_keep_the_pace_of_the_recording(hear, path, messages,
 
 
 def test_topics_are_chosen_and_what_cannot_be_played_is_named(hear, path, tmp_path, messages):
-    """Before any wait for subscribers; types that are not installed are skipped."""
+    """Types that are not installed are skipped."""
     hear({})
     assert play(path, HURRIED, topics=['/imu']) == {'/imu': COUNTS['/imu']}
-    start = time.monotonic()
     with pytest.raises(BagError, match=r'has no topic /x; --topics can be: /ground_truth, /image'):
         play(path, FAST, topics=['/x'])
-    assert time.monotonic() - start < FAST.wait / 2
-    assert message_class('sensor_msgs/msg/Imu') is Imu
-    for kind in ('sensor_msgs/msg/Nothing', 'nowhere_msgs/msg/Imu', '', 'a b/msg/C'):
-        assert message_class(kind) is None
-    kinds = {'sensor_msgs/msg/Imu': 'nowhere_msgs/msg/Imu'}
-    write_database(tmp_path / 'a.db3', messages, kind=lambda name: kinds.get(name, name))
-    played = play(tmp_path / 'a.db3', HURRIED)
-    assert '/imu' not in played and played['/odom'] == COUNTS['/odom']
+    for other in ('nowhere_msgs/msg/Imu', 'sensor_msgs/msg/Nothing'):
+        kinds, file = {'sensor_msgs/msg/Imu': other}, tmp_path / other / 'a.db3'
+        write_database(file, messages, kind=lambda name, k=kinds: k.get(name, name))
+        played = play(file, HURRIED)
+        assert '/imu' not in played and played['/odom'] == COUNTS['/odom']
     write_database(tmp_path / 'b.db3', messages, kind=lambda name: 'nowhere_msgs/msg/Any')
     write_ros1(tmp_path / 'c.bag', messages)
     for name, why in {'b.db3': '/imu: type nowhere_msgs/msg/Any', 'c.bag': 'to ROS 2'}.items():
