@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres, alone
-from test_keyframes import CONFIG, COUNTER, learnt, stds, unseen, within
+from test_keyframes import COUNTER, learnt, stds, unseen, within
 from test_location import STD, fit_at, locate
 
 from sfa_localization.keyframes.light import Conditions
@@ -30,13 +30,13 @@ def sunny(poses, config, share=0.3):
 
 
 @cache
-def drive(light, config=CONFIG, **share):
+def drive(light, **share):
     """Locations of 110 images in a light, without and with the conditions by earlier images; the
     poses, and the conditions.
     """
-    keyframes, conditions = learnt(Spheres.about(1), config), Conditions()
+    keyframes, conditions = learnt(Spheres.about(1), COUNTER), Conditions()
     plain, adapted, poses = [], [], unseen(150)
-    for image in light(poses, config, **share):
+    for image in light(poses, COUNTER, **share):
         plain.append(alone(keyframes, image))
         adapted.append(alone(keyframes, image, conditions))
         conditions.add(adapted[-1])
@@ -51,12 +51,11 @@ def test_in_another_light_ellipses_are_small_and_hold(light):
     assert within(adapted, poses) > 0.9
 
 
-@pytest.mark.parametrize('config', [CONFIG, COUNTER])
-def test_what_the_light_adds_everywhere_moves_no_place(config):
+def test_what_the_light_adds_everywhere_moves_no_place():
     """In the light of the training nothing changes."""
     patterns = []
     for share, most in ((0.3, 0.75), (0.0, 1.1)):
-        *locations, poses, conditions = drive(sunny, config, share=share)
+        *locations, poses, conditions = drive(sunny, share=share)
         positions = np.array([[each.pose[:2] for each in of] for of in locations])
         plain, adapted = np.linalg.norm(positions - poses[:, :2], axis=2).mean(1)
         assert adapted < most * plain
@@ -88,9 +87,8 @@ def test_the_pattern_is_a_mean_over_places():
     assert np.std(conditions.pattern) < 0.3
 
 
-@pytest.mark.parametrize('claimed', [0.05, 0.1, 0.3])
-def test_slow_features_count_by_their_latest_errors(claimed):
-    conditions, rng = Conditions(), np.random.default_rng(0)
+def test_slow_features_count_by_their_latest_errors():
+    conditions, rng, claimed = Conditions(), np.random.default_rng(0), 0.3
     for wrong, least, most in ((1.0, 1.0, 1.5), (10.0, 6.0, 15.0), (1.0, 1.0, 1.5)):
         for _ in range(60):
             x, slow = STD * rng.normal(), wrong * claimed * rng.normal(size=2)

@@ -25,7 +25,7 @@ from sfa_localization.place_model import FORMAT, VERSION, PlaceModel
 
 @pytest.fixture(scope='module')
 def model() -> PlaceModel:
-    return place().model
+    return place(True).model
 
 
 @pytest.fixture(scope='module')
@@ -72,7 +72,7 @@ def test_images_are_located(clockwise):
     error = np.array([e.pose for e in estimates]) - truth
     assert np.median(np.hypot(*error[:, :2].T)) < 0.3
     assert np.degrees(np.median(np.abs(wrap_angle(error[:, 2])))) < 3
-    for image, together in zip(images[::4], estimates[::4], strict=True):
+    for image, together in zip(images[::9], estimates[::9], strict=True):
         alone = place(clockwise).model.locate(image)
         # Float32 rounds their headings differently, and the position follows.
         assert np.allclose(alone.pose, together.pose, atol=1e-4)
@@ -87,7 +87,7 @@ def test_rolled_columns_turn_the_robot(clockwise, steps):
     model, columns = place(clockwise).model, steps * COLUMN_STEP
     # A robot that turned left sees everything farther right: at larger columns when clockwise.
     turn = (1 if clockwise else -1) * 2 * np.pi * columns / PLACE_SIZE[1]
-    for picture in visit(clockwise).panoramas.read(0, 10):
+    for picture in visit(clockwise).panoramas.read(0, 4):
         plain, turned = model.locate(picture), model.locate(np.roll(picture, columns, axis=1))
         assert abs(wrap_angle(turned.yaw - plain.yaw - turn)) < np.radians(2)
         assert np.abs(turned.position - plain.position).max() < 0.1
@@ -95,6 +95,7 @@ def test_rolled_columns_turn_the_robot(clockwise, steps):
 
 
 def test_covariances_are_positive_definite(model, pictures):
+    pictures = pictures[::3]
     strange = np.random.default_rng(0).integers(0, 256, pictures.shape, np.uint8)
     for estimate in model.locate_all(np.concatenate([pictures, strange])):
         assert np.allclose(estimate.covariance, estimate.covariance.T)
@@ -113,17 +114,6 @@ def test_at_an_uncertain_heading_the_map_knows_little(model, pictures):
     sure = model.located(view, Conditions()).fit
     certain, uncertain = model._slow_places(view, [sure, replace(sure, unlike=100.0)])[1]
     assert uncertain > 10 * certain
-
-
-def test_symmetric_panoramas_raise_the_variance(model, pictures):
-    """Scenes that look alike in two directions, as corridors do, do not tell them."""
-    turned = np.roll(pictures, pictures.shape[2] // 2, axis=2)
-    symmetric = np.mean([pictures, turned], axis=0).round().astype(np.uint8)
-    usual, lost = (
-        np.array([e.covariance[2, 2] for e in model.locate_all(p)]) for p in (pictures, symmetric)
-    )
-    assert np.sqrt(usual.max()) < np.radians(1)
-    assert np.sqrt(lost.min()) > np.radians(30)
 
 
 def test_other_pictures_are_refused(model):
