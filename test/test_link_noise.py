@@ -36,11 +36,12 @@ def worse(segments, factor, seed=0):
 
 @cache
 def recorded():
-    """A drive, its segments, and features of its images."""
+    """A drive, its segments, features of its images, and the fit of them."""
     twists, start = meander(250.0, seed=2)
     run = drive(twists, start=start, yaw_noise=0.01, speed_noise=0.03, seed=2)
     segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
-    return run, segments, garden_features(run.poses[:, :2], noise=0.05)
+    features = garden_features(run.poses[:, :2], noise=0.05)
+    return run, segments, features, solved(segments, features)
 
 
 def solved(segments, features):
@@ -52,58 +53,46 @@ def solved(segments, features):
 
 def factors(fit):
     """How many times the stated variance each link of a fit has: of turns, of displacements."""
-    stated, learned = fit.problem.links, fit.links
-    return (
-        learned.turn_variance / stated.turn_variance,
-        learned.displacement_variance / stated.displacement_variance,
-    )
+    names = 'turn_variance', 'displacement_variance'
+    return [getattr(fit.links, name) / getattr(fit.problem.links, name) for name in names]
 
 
-def test_links_weigh_less_where_they_err_by_more_than_they_say():
-    _, segments, features = recorded()
-    for factor in factors(solved(segments, features)):
+def error(fit):
+    """Mean error of a map, m."""
+    places = np.column_stack([fit.places.real, fit.places.imag])
+    truth = recorded()[0].poses[fit.stack.images, :2]
+    return np.hypot(*(align(places, truth).apply(places) - truth).T).mean()
+
+
+def test_links_that_err_by_more_than_they_say_weigh_less_for_the_good_of_the_map(
+    monkeypatch,
+):
+    _, segments, features, right = recorded()
+    for factor in factors(right):
         assert 0.8 < np.median(factor) < 1.2 and factor.max() < 3.0
-    for factor in factors(solved(worse(segments, 16.0), features)):
+    wrong = worse(segments, 16.0)
+    fit = solved(wrong, features)
+    for factor in factors(fit):
         assert 5.0 < np.median(factor) < 25.0
-
-
-def test_the_map_is_better_for_it(monkeypatch):
-    run, segments, features = recorded()
-
-    def error(fit):
-        places = np.column_stack([fit.places.real, fit.places.imag])
-        truth = run.poses[fit.stack.images, :2]
-        return np.hypot(*(align(places, truth).apply(places) - truth).T).mean()
-
-    learned = error(solved(worse(segments, 16.0), features))
     monkeypatch.setattr(Links, 'learned', lambda stated, *_: stated)
-    assert learned < 0.9 * error(solved(worse(segments, 16.0), features))
+    assert error(fit) < 0.9 * error(solved(wrong, features))
 
 
 def test_a_wheel_that_slips_costs_single_links():
-    _, segments, features = recorded()
+    _, segments, features, right = recorded()
     slipped = list(segments)
     for n in (10, 40, 70):
         slipped[n] = dataclasses.replace(slipped[n], displacement=slipped[n].displacement + 0.7)
-    _, before = factors(solved(segments, features))
     fit = solved(dataclasses.replace(segments, items=tuple(slipped)), features)
-    _, move = factors(fit)
+    (_, before), (_, move) = factors(right), factors(fit)
     wrong = np.isin(fit.links.at, (10, 40, 70))
     assert move[wrong].min() > 10.0
     assert np.median(move[~wrong]) < 1.5 * np.median(before)
 
 
-def test_links_without_weight_stay_without():
-    _, segments, features = recorded()
-    unused = tuple(dataclasses.replace(item, turn_variance=np.inf) for item in segments)
-    links = solved(dataclasses.replace(segments, items=unused), features).links
-    assert np.isinf(links.turn_variance).all() and np.isfinite(links.displacement_variance).all()
-
-
 def test_the_gram_is_what_eq_1_costs_at_the_best_map():
-    """And Newton's derivatives are those of the cost of poses and biases."""
-    _, segments, features = recorded()
-    fit, rng = solved(segments, features), np.random.default_rng(0)
+    """And Newton's derivatives are those of poses and biases."""
+    fit, rng = recorded()[3], np.random.default_rng(0)
     stack, n, ridge = fit.stack, fit.stack.segments, fit.ridge
     bias = 1e-3 * rng.normal(size=stack.period[-1] + 1)
     z = np.exp(1j * rng.uniform(-3, 3, n))
@@ -114,12 +103,11 @@ def test_the_gram_is_what_eq_1_costs_at_the_best_map():
     prior = ridge.basis.ridge @ np.abs(weights) ** 2
     total = ridge.weights @ np.abs(residuals) ** 2 + prior
     assert np.vdot(y, ridge.gram(stack) @ y).real == pytest.approx(total)
-    by, small = derivative(poses, stack.period), 1e-6
-    for column, (turned, moved) in ((2 * n + 3, (1, 0)), (3, (0, 1))):
-        step = small * (np.arange(n) == 3)
-        other = SegmentPoses(z * np.exp(1j * turned * step), poses.o + moved * step, bias)
+    by, small, third = derivative(poses, stack.period), 1e-6, np.arange(n) == 3
+    for column, other in (
+        (2 * n + 3, SegmentPoses(z * np.exp(1j * small * third), poses.o, bias)),
+        (3, SegmentPoses(z, poses.o + small * third, bias)),
+        (3 * n, SegmentPoses(z, poses.o, bias + small * (np.arange(len(bias)) == 0))),
+    ):
         change = (other.coefficients(stack.period) - y) / small
         np.testing.assert_allclose(by[:, [column]].toarray()[:, 0], change, atol=1e-4)
-    other = SegmentPoses(z, poses.o, bias + small * (np.arange(len(bias)) == 0))
-    change = (other.coefficients(stack.period) - y) / small
-    np.testing.assert_allclose(by[:, [3 * n]].toarray()[:, 0], change, atol=1e-4)
