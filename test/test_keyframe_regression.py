@@ -57,18 +57,17 @@ def fit_among(image, keyframes, places, columns, channels=None, drives=None) -> 
 
 
 @SIZES
-def test_a_place_between_keyframes_is_measured_whatever_the_rest_of_the_angle(columns):
+@pytest.mark.parametrize('place', [(0.2, -0.3), (-0.4, 0.4)])
+def test_a_place_between_keyframes_is_measured_whatever_the_rest_of_the_angle(columns, place):
     scene = KeyframeSquare(columns)
-    for place in ((0.0, 0.0), (0.2, -0.3), (-0.4, 0.4)):
-        fit = scene.fit(place)
-        assert np.allclose(fit.place, place, atol=0.01)
-        assert np.abs(fit.changes).max() < 5e-3 and 0 <= fit.unlike < 1e-3
-        assert np.allclose([*fit.shares @ scene.places, fit.shares.sum()], [*fit.place, 1])
-    for angle in (-0.02, 0.03):
-        image = turned(scene.seen((0.1, 0.2))[None], np.array([angle]))[0]
-        fit = fit_among(image, scene.kept, scene.places, columns)
-        assert fit.changes == pytest.approx([0.0, 0.0, angle], rel=0.1)
-        assert np.allclose(fit.place, (0.1, 0.2), atol=0.02)
+    fit = scene.fit(place)
+    assert np.allclose(fit.place, place, atol=0.01)
+    assert np.abs(fit.changes).max() < 5e-3 and 0 <= fit.unlike < 1e-3
+    assert np.allclose([*fit.shares @ scene.places, fit.shares.sum()], [*fit.place, 1])
+    image = turned(scene.seen(place)[None], np.array([0.03]))[0]
+    fit = fit_among(image, scene.kept, scene.places, columns)
+    assert fit.changes == pytest.approx([0.0, 0.0, 0.03], abs=3e-3)
+    assert np.allclose(fit.place, place, atol=0.02)
 
 
 def test_what_no_place_explains_is_unlike_and_moves_little_and_no_texture_is_finite():
@@ -99,7 +98,7 @@ def test_keyframes_along_a_line_in_another_light_show_the_place_across_it():
 NOISE = spectrum(2 * smooth(np.random.default_rng(9), 60))
 
 
-@pytest.mark.parametrize('spoil', [np.negative, np.zeros_like, lambda image: image + NOISE])
+@pytest.mark.parametrize('spoil', [np.negative, lambda image: image + NOISE])
 def test_a_channel_that_shows_something_else_counts_little(spoil):
     """Two channels of the same scene, the second of the image spoilt."""
     scene, place = KeyframeSquare(), np.array([0.3, -0.2])
@@ -112,17 +111,14 @@ def test_a_channel_that_shows_something_else_counts_little(spoil):
     assert fit.unlike < 0.3 * plain.unlike
 
 
-def lit(rng, columns, share):
-    """What a light adds to a texture: other things in each sector of 22.5 degrees."""
-    sectors = np.repeat(rng.normal(size=(ROWS, 16)), -(-columns // 16), axis=1)[:, :columns]
-    return share * normalized((sectors * rng.normal(1.0, 0.3, sectors.shape)).astype(np.float32))
-
-
-@SIZES
-@pytest.mark.parametrize('share', [0.1, 0.5])
+@pytest.mark.parametrize(('columns', 'share'), [(60, 0.5), (61, 0.1)])
 def test_the_variance_is_what_light_moves_the_place_by(columns, share):
-    scene, rng, place = KeyframeSquare(columns), np.random.default_rng(7), np.array([0.1, -0.2])
-    fits = [scene.fit(place, lit(rng, columns, share)) for _ in range(300)]
+    """A light that adds other things in each sector of 22.5 degrees."""
+    scene, rng, place, fits = KeyframeSquare(columns), np.random.default_rng(7), (0.1, -0.2), []
+    for _ in range(300):
+        sectors = np.repeat(rng.normal(size=(ROWS, 16)), 4, axis=1)[:, :columns]
+        light = normalized((sectors * rng.normal(1.0, 0.3, sectors.shape)).astype(np.float32))
+        fits.append(scene.fit(place, share * light))
     true = np.mean([np.sum((fit.place - place) ** 2) for fit in fits]) / 2
     assert 0.6 < np.mean([fit.variance for fit in fits]) / true < 1.7
 
