@@ -16,7 +16,6 @@ from metric_worlds import (
     straight,
     turn,
 )
-from scipy import sparse
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import align, compose, wrap_angle
@@ -26,8 +25,7 @@ from sfa_localization.keyframes.offsets import find_offsets
 from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.metric import selection
 from sfa_localization.metric.learning import learn_metric
-from sfa_localization.metric.links import Links
-from sfa_localization.metric.loops import Loops, rough_offsets, with_closures
+from sfa_localization.metric.loops import rough_offsets, with_closures
 from sfa_localization.metric.pose_graph import Graph, cost, form_of, graph_poses, proof, refined
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -135,24 +133,6 @@ def test_offsets_tie_drives_whose_features_have_nothing_in_common_and_do_not_ben
     assert position_error < 0.25 and yaw_error < 0.03
 
 
-def test_the_form_is_the_sum_of_the_weighted_squares():
-    poses, _, segments, _ = in_two_lights()
-    stack = Stack.of(segments)
-    offsets, rng, n = mixtures(stack, poses, count=60), np.random.default_rng(0), stack.segments
-    z, o = np.exp(1j * rng.uniform(-3, 3, n)), rng.normal(size=n) + 1j * rng.normal(size=n)
-    solution = SegmentPoses(z, o, rng.normal(0, 1e-6, stack.period[-1] + 1))
-    facing, places = np.full((2, len(poses)), np.nan, complex)
-    facing[stack.images] = np.exp(1j * stack.yaws(solution))
-    places[stack.images] = solution.places(stack)
-    loops = Loops.of(offsets, stack)
-    mixed_facing = (offsets.shares * np.exp(1j * offsets.turn) * facing[offsets.others]).sum(1)
-    mixed_place = (offsets.shares * places[offsets.others]).sum(1)
-    total = loops.share / loops.turn_std**2 @ np.abs(facing[offsets.images] - mixed_facing) ** 2
-    total += loops.share / loops.place_std**2 @ np.abs(places[offsets.images] - mixed_place) ** 2
-    ties = loops.ties(stack, None) @ solution.coefficients(stack.period)
-    assert np.sum(np.abs(ties) ** 2) == pytest.approx(total, rel=1e-4)
-
-
 def test_offsets_hold_in_any_frame():
     drives = [wander(250, 0), wander(200, 1)]
     seen, poses = views([Spheres.about(0)] * 2, drives), np.concatenate(drives)
@@ -187,25 +167,6 @@ def measured_world(noise_m=0.02, seed=0):
     poses, _, segments, _ = in_two_lights()
     offsets = mixtures(Stack.of(segments), poses, noise_m, 1000, seed, lasting=True)
     return poses, dataclasses.replace(segments, offsets=offsets)
-
-
-def test_the_graph_proves_what_is_best_and_nothing_else():
-    """As H - Lambda >= 0 does, H being the form in z at the best o."""
-    _, segments = measured_world()
-    stack = Stack.of(segments)
-    n, bias = stack.segments, np.zeros(stack.period[-1] + 1)
-    ties = Links.of(segments).ties(stack), Loops.of(segments.offsets, stack).ties(stack, None)
-    without_bias = sparse.diags_array(np.repeat([1.0, 1.0, 0.0], n))
-    form = form_of(sparse.vstack(ties) @ without_bias, stack)
-    system = form.toarray()
-    origins = -np.linalg.solve(system[:n, :n], system[:n, n : 2 * n])
-    h = system[n : 2 * n, n : 2 * n] + system[n : 2 * n, :n] @ origins
-    best = Graph.solved(form, stack).poses.z
-    for z, right in ((best, True), (best * np.where(np.arange(n) < n // 2, 1, -1), False)):
-        multipliers = np.real(z.conj() * (h @ z))
-        least = np.linalg.eigvalsh(h - np.diag(multipliers))[0]
-        assert (least > -1e-9 * np.linalg.norm(h, 2)) == right
-        assert proof(form, SegmentPoses(z, origins @ z, bias), stack.period).certified == right
 
 
 def test_angles_that_wind_around_a_ring_are_no_minimum():

@@ -68,8 +68,7 @@ def seen(x, residual, outward=0.2) -> Location:
 
 
 def test_the_pattern_is_a_mean_over_places():
-    """What is unusual about a single place, as a visitor there, hardly changes it."""
-    share, rng, conditions = np.ones((3, 4)), np.random.default_rng(0), Conditions()
+    share, conditions = np.ones((3, 4)), Conditions()
     conditions.add(seen(0.0, share))
     once = conditions.pattern.copy()
     for _ in range(100):
@@ -79,12 +78,6 @@ def test_the_pattern_is_a_mean_over_places():
     assert np.array_equal(conditions.pattern, once), 'nor does one beside the keyframes'
     conditions.add(seen(0.4, share))
     assert np.all(conditions.pattern.real > once.real)
-    conditions = Conditions()
-    for k in range(300):
-        before = 0.0 if conditions.pattern is None else conditions.pattern
-        conditions.add(seen(0.3 * k, share + rng.normal(0, 1.0, share.shape) - before))
-    assert np.abs(conditions.pattern.mean() - 1) < 0.15
-    assert np.std(conditions.pattern) < 0.3
 
 
 def test_slow_features_count_by_their_latest_errors():

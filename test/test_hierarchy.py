@@ -5,11 +5,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from cylinder_worlds import ARCHITECTURE, SIZE, drive
 from test_rotation import brute_force, views
 
-from sfa_localization.data.errors import DataError
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.sfa import network_training as hierarchy
 from sfa_localization.sfa.network import Network, Node, expand, input_map
@@ -101,12 +99,3 @@ def test_the_random_light_of_a_picture_is_the_same_in_every_shard_and_pass():
     assert np.array_equal(lit(4), whole[4:])
     assert not np.array_equal(lit(0, seed=6), whole)
     assert whole.mean((1, 2, 3)).std() > 3 * plain.mean((1, 2, 3)).std()
-
-
-def test_what_has_no_difference_is_refused():
-    of, images = drive(2), np.full((5, *SIZE, 3), 99, np.uint8)
-    first = PanoramaArray(of.panoramas.stamps_ns[:1], of.panoramas.read(0, 1))
-    with pytest.raises(DataError, match='two consecutive'):
-        trained(ImageSequence(first, of.joined[:0]))
-    with pytest.raises(DataError, match='rank'):
-        trained(ImageSequence(PanoramaArray(np.arange(5), images), np.ones(4, bool)))

@@ -13,8 +13,6 @@ from test_hierarchy import assert_alike
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.sfa import mdp_engine, mdp_shim
 from sfa_localization.sfa import network_training as hierarchy
-from sfa_localization.sfa.network import input_map
-from sfa_localization.sfa.rotation import unfold
 
 try:
     mdp = mdp_shim.import_mdp()
@@ -33,18 +31,6 @@ def test_engines_learn_the_same_features(relative_cut):
     assert_alike(ours.maps(images), theirs.maps(images), 0.9999)
     for pair in zip(ours.deltas, theirs.deltas, strict=True):
         assert np.allclose(*pair, rtol=2e-3)
-
-
-def test_the_network_is_the_flow_of_switchboards_that_show_what_fields_see():
-    of = drive(12)
-    flow, network = mdp_engine.train_flow(ARCHITECTURE, hierarchy.shards_of([of], 0, 0.0), 1e-7)
-    images = of.panoramas.read(3, 5)
-    flat = input_map(images, ARCHITECTURE).reshape(2, -1).astype(float)
-    assert np.allclose(flow.execute(flat).reshape(2, 1, 12, 4), network.maps(images)[-1], atol=2e-3)
-    maps = np.random.default_rng(0).normal(size=(1, 5, 12, 3)).astype(np.float32)
-    for receptive in ARCHITECTURE.fields:
-        wires, seen = mdp_engine.connections((5, 12, 3), receptive), unfold(maps, receptive)
-        assert np.array_equal(maps.ravel()[wires], seen.reshape(-1, seen.shape[-1]))
 
 
 def test_shim_leaves_no_patch_behind():

@@ -3,7 +3,6 @@
 """Errors of wheels that images show: in turns, by loop closures, and of the way lost in turns."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -24,7 +23,6 @@ from sfa_localization.metric.odometry_errors import (
     corrections,
     way_of,
 )
-from sfa_localization.metric.segments import cut_track
 from sfa_localization.metric.settings import SegmentConfig
 from sfa_localization.reports.summary import summary
 from sfa_localization.sfa.network_training import ImageSequence, train_network
@@ -95,22 +93,6 @@ def test_nothing_is_corrected_without_evidence_that_images_turn_better():
     pairs = np.column_stack([rng.integers(0, first, 200), first + rng.integers(0, 500, 200)])
     for closures in (few, Closures(pairs, rng.uniform(-3, 3, 200))):
         assert corrections(headings_of(bad, 0.004), closures) is None
-
-
-def test_segments_of_corrected_turns_are_longer_and_their_links_stronger():
-    run, _ = drives(0.04)
-    yaw, track = np.unwrap(run.poses[:, 2]), OdometryTrack.of(run.odometry, CONFIG)
-    at, noise = np.searchsorted(track.stamps_ns, run.stamps_ns), CONFIG.yaw_noise
-    exact = track.corrected(run.stamps_ns, yaw - track.yaw[at], noise)
-    before, after = (cut_track(each, run.stamps_ns, CONFIG) for each in (track, exact))
-    for a, b in itertools.pairwise(after.items):
-        assert abs(wrap_angle(a.turn_rad - (yaw[b.images[0]] - yaw[a.images[0]]))) < 1e-6
-        assert a.turn_variance >= noise**2 * a.turn_time_s * 0.99
-    weak, strong = (
-        np.median([s.displacement_variance / s.turn_time_s for s in part if s.linked])
-        for part in (before, after)
-    )
-    assert len(after) < len(before) and strong < weak
 
 
 def test_a_training_turns_by_its_images_where_wheels_slip():

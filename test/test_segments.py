@@ -12,7 +12,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import compose, relative, wrap_angle
 from sfa_localization.data.run import Odometry, YawRate
 from sfa_localization.metric import segments as segments_module
-from sfa_localization.metric.segments import PIECE_LENGTH_M, assignment, cut, join
+from sfa_localization.metric.segments import PIECE_LENGTH_M, cut
 from sfa_localization.metric.settings import SegmentConfig
 
 ANY = SegmentConfig()
@@ -47,7 +47,8 @@ def check_segments(segments, poses, tolerance=1e-6):
 def test_a_square_gives_its_four_sides():
     run = drive(SQUARE)
     silent = replace(run.odometry, twists=np.zeros_like(run.odometry.twists))
-    for odometry in (run.odometry, silent):
+    elsewhere = compose(np.array([30.0, -7.0, 2.5]), run.odometry.poses)
+    for odometry in (run.odometry, silent, replace(run.odometry, poses=elsewhere)):
         segments = cut(odometry, run.stamps_ns, STRAIGHT)
         assert [round(length_m(s), 1) for s in segments] == pytest.approx([4.8] * 4, abs=0.25)
         turns = [s.turn_rad for s in segments.items[:-1]]
@@ -147,18 +148,6 @@ def test_links_err_as_they_or_the_messages_say(monkeypatch):
     assert link.turn_variance == pytest.approx(4.0 * 0.02**2 * 3.0 * 50, rel=0.1)
 
 
-def test_joined_runs_have_separate_images_and_no_link():
-    run = drive(SQUARE)
-    single, count = cut(run.odometry, run.stamps_ns, STRAIGHT), len(run.stamps_ns)
-    both = join([single, single], [0, count])
-    assert len(both) == 8 and not both[3].linked
-    assert [s.run for s in both] == [0] * 4 + [1] * 4
-    assert both.images.used == 2 * single.images.used
-    owner = assignment(both, 2 * count)
-    assert np.array_equal(np.flatnonzero(owner == 4), single[0].images + count)
-    assert (owner == -1).sum() == 2 * count - both.images.used
-
-
 def test_a_drive_without_segments_says_what_to_do():
     for twists, config, remedy in (
         (stand(10.0), ANY, 'robot drives'),
@@ -167,20 +156,3 @@ def test_a_drive_without_segments_says_what_to_do():
         run = drive(twists)
         with pytest.raises(DataError, match=remedy):
             cut(run.odometry, run.stamps_ns, config)
-
-
-@pytest.mark.parametrize(('config', 'gyro'), [(ANY, True), (STRAIGHT, False)])
-def test_the_frame_of_the_odometry_turns_the_starts_and_nothing_else(config, gyro):
-    twists, start = criss_cross(6)
-    run, frame = drive(twists, start=start), np.array([30.0, -7.0, 2.5])
-    elsewhere = replace(run.odometry, poses=compose(frame, run.odometry.poses))
-    here, there = (
-        cut(odometry, run.stamps_ns, config, run.gyro if gyro else None)
-        for odometry in (run.odometry, elsewhere)
-    )
-    for a, b in zip(here, there, strict=True):
-        assert np.allclose(relative(compose(frame, a.start), b.start), 0, atol=1e-9)
-        assert np.allclose(a.path, b.path) and np.allclose(a.headings, b.headings)
-        if a.linked:
-            assert a.turn_rad == pytest.approx(b.turn_rad)
-            assert a.displacement == pytest.approx(b.displacement)

@@ -5,10 +5,9 @@
 from dataclasses import replace
 from functools import cache
 
-import cv2
 import numpy as np
 import pytest
-from cylinder_worlds import Spheres, alone, recipe, run_in, wander
+from cylinder_worlds import Spheres, recipe, run_in, wander
 from test_keyframes import HOME, drive, errors, familiar, keyframes_of, unseen
 
 from sfa_localization.camera.leveling import NEAR_NS, leveled, tilted, tilts_at
@@ -18,19 +17,11 @@ from sfa_localization.data.sphere import Sphere
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.leveling import leveled_runs
 from sfa_localization.keyframes.texture import spectrum, texture, turned
-from sfa_localization.keyframes.tilt import derivatives, find_tilt
-from sfa_localization.keyframes.upright import upright
+from sfa_localization.keyframes.tilt import find_tilt
 
 BOTH = pytest.mark.parametrize('clockwise', [True, False])
 SPHERE = Sphere(-0.6, 0.6)
 CONFIG = PanoramaConfig(width=160, height=40, elevation_min=-34.4, elevation_max=34.4)
-
-
-def smooth(sphere: Sphere, rows: int = 40, columns: int = 160) -> np.ndarray:
-    """A panorama (rows, columns) of random blobs."""
-    rough = np.random.default_rng(3).normal(size=(rows, 3 * columns)).astype(np.float32)
-    rough[:, :columns] = rough[:, -columns:] = rough[:, columns : 2 * columns]
-    return 40 * cv2.GaussianBlur(rough, (0, 0), 3)[:, columns : 2 * columns]
 
 
 @BOTH
@@ -47,19 +38,11 @@ def test_things_sink_in_the_image_where_the_camera_rises(clockwise):
         assert moved == pytest.approx(expected, abs=0.1)
 
 
-@BOTH
-def test_the_derivatives_are_those_of_the_tilted_panorama_and_leveling_undoes_a_tilt(clockwise):
-    sphere = Sphere(-0.6, 0.6, clockwise)
-    image = smooth(sphere)
-    for k, tilt in enumerate(np.eye(2) * 0.004):
-        ahead, behind = (tilted(image[..., None], s * tilt, sphere)[..., 0] for s in (1, -1))
-        numeric, analytic = (ahead - behind) / 0.008, derivatives(image, [slice(0, 40)], sphere)[k]
-        inner = np.s_[3:-3]
-        assert np.corrcoef(numeric[inner].ravel(), analytic[inner].ravel())[0, 1] > 0.99
-        assert np.std(analytic[inner]) == pytest.approx(np.std(numeric[inner]), rel=0.05)
-    tilt = np.array([0.05, -0.07])
-    back = leveled(tilted(image[..., None], tilt, sphere), tilt, sphere)[..., 0]
-    assert np.abs(back - image)[8:-8].mean() < 0.1 * np.abs(image).mean()
+def test_leveling_undoes_a_tilt():
+    image, tilt = HOME.panoramas(np.zeros((1, 3)), CONFIG)[0], np.array([0.05, -0.07])
+    back = leveled(tilted(image, tilt, SPHERE), tilt, SPHERE)
+    off = np.abs(back - image.astype(float))[8:-8]
+    assert off.mean() < 0.1 * np.abs(image - image.mean()).mean()
 
 
 CHANNELS = slice(0, 16), slice(16, 24), slice(24, 32)
@@ -103,18 +86,6 @@ def test_a_tilted_image_is_located_like_a_level_one():
     rest = np.hypot(*(np.array([location.tilt for location in locations]) - tilts).T)
     assert np.degrees(np.median(rest)) < 0.5
     assert all(map(familiar, locations))
-
-
-@pytest.mark.parametrize('degrees', [(12, 2), (-3, 11)])
-def test_what_a_steep_tilt_hides_counts_neither_for_nor_against_a_place(degrees):
-    tilt = np.radians(degrees)
-    for image in HOME.panoramas(unseen(6), CONFIG):
-        both = image, tilted(image, tilt, SPHERE)
-        flat, steep = (alone(learnt(), each) for each in both)
-        like, as_like = (upright(learnt(), each).score for each in both)
-        assert as_like == pytest.approx(like, abs=0.1)
-        assert np.hypot(*(steep.pose - flat.pose)[:2]) < 0.3
-        assert np.hypot(*(steep.tilt - tilt)) < np.radians(1.0)
 
 
 @BOTH
