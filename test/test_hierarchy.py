@@ -2,13 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training the network: equal to the paper's explicit sequence, in shards, again and again."""
 
-from dataclasses import replace
+import subprocess
+import sys
 
 import numpy as np
+import pytest
 from cylinder_worlds import ARCHITECTURE, SIZE, drive
 from test_rotation import brute_force, views
 
+from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.run import PanoramaArray
+from sfa_localization.sfa import mdp_engine, mdp_shim
 from sfa_localization.sfa import network_training as hierarchy
 from sfa_localization.sfa.network import Network, Node, expand, input_map
 from sfa_localization.sfa.network_training import ImageSequence, shards_of, train_network
@@ -18,8 +22,9 @@ CUT = 1e-7
 """Keeps what float64 and float32 agree on, so that both networks have the same directions."""
 
 
-def trained(*sequences: ImageSequence, **options) -> Network:
-    return train_network(ARCHITECTURE, sequences, light_std=0.0, relative_cut=CUT, **options)
+def trained(*sequences: ImageSequence, light_std=0.0, relative_cut=CUT) -> Network:
+    options = {'light_std': light_std, 'relative_cut': relative_cut}
+    return train_network(ARCHITECTURE, sequences, **options)
 
 
 def explicit_network(of: ImageSequence) -> Network:
@@ -53,8 +58,11 @@ def test_features_equal_those_of_the_explicit_sequence_also_in_shards(monkeypatc
     images = of.panoramas.read(0, 24)
     whole = trained(of).maps(images)
     assert_alike(whole, explicit_network(of).maps(images), 0.9999)
+    in_light = trained(of, light_std=0.3).maps(images)
     monkeypatch.setattr(hierarchy, 'SHARD', 7)
     assert_alike(whole, trained(of).maps(images))
+    assert_alike(in_light, trained(of, light_std=0.3).maps(images))
+    assert not np.allclose(in_light[-1], whole[-1], atol=0.1)
 
 
 def test_drives_do_not_touch():
@@ -73,15 +81,6 @@ def test_drives_do_not_touch():
     assert not np.allclose(separate.nodes[0].linear, trained(both).nodes[0].linear, atol=1e-4)
 
 
-def test_stages_resumed_give_the_same_bytes():
-    of, partials = drive(16), []
-    whole = trained(of, on_stage=partials.append)
-    assert len(partials) == 6
-    for partial in partials:
-        resumed = trained(of, start=partial)
-        assert resumed.nodes[-1].slow.tobytes() == whole.nodes[-1].slow.tobytes()
-
-
 def test_of_a_long_drive_some_images_all_along_it_are_used(monkeypatch):
     monkeypatch.setattr(hierarchy, 'MOST', 20)
     shards = shards_of([drive(160), drive(2)], 0)
@@ -90,12 +89,44 @@ def test_of_a_long_drive_some_images_all_along_it_are_used(monkeypatch):
     ]  # fmt: skip
 
 
-def test_the_random_light_of_a_picture_is_the_same_in_every_shard_and_pass():
-    def lit(start: int, std: float = 0.3, seed: int = 5) -> np.ndarray:
-        shard = replace(shards_of([drive(12)], seed, std)[0], start=start, stop=12)
-        return np.concatenate([images for images, _ in shard.batches()])
+@pytest.fixture
+def mdp():
+    try:
+        return mdp_shim.import_mdp()
+    except ConfigError as error:
+        return pytest.skip(str(error))
 
-    whole, plain = lit(0), lit(0, std=0.0)
-    assert np.array_equal(lit(4), whole[4:])
-    assert not np.array_equal(lit(0, seed=6), whole)
-    assert whole.mean((1, 2, 3)).std() > 3 * plain.mean((1, 2, 3)).std()
+
+@pytest.mark.parametrize('relative_cut', [1e-2, CUT])
+def test_the_engine_of_mdp_learns_the_same_features(relative_cut, mdp):
+    of = drive(24)
+    of.joined[[7, 15]] = False
+    images, options = of.panoramas.read(0, 24), {'light_std': 0.0, 'relative_cut': relative_cut}
+    ours = trained(of, relative_cut=relative_cut)
+    theirs = mdp_engine.train_network(ARCHITECTURE, [of], **options)
+    assert ours.ranks == theirs.ranks
+    assert_alike(ours.maps(images), theirs.maps(images), 0.9999)
+    for pair in zip(ours.deltas, theirs.deltas, strict=True):
+        assert np.allclose(*pair, rtol=2e-3)
+
+
+def test_the_shim_of_mdp_leaves_no_patch_behind(mdp):
+    """In a fresh interpreter."""
+    code = (
+        'import inspect, numpy\n'
+        'before = set(vars(numpy)), inspect.getfullargspec\n'
+        'from sfa_localization.sfa.mdp_shim import import_mdp\n'
+        'mdp = import_mdp()\n'
+        'assert import_mdp() is mdp\n'
+        'gone = set(vars(numpy)) - before[0]\n'
+        "assert 'typeDict' not in gone, gone\n"
+        'assert inspect.getfullargspec is before[1]\n'
+        'mdp.nodes.SFANode(output_dim=1).train(numpy.eye(9).cumsum(0))\n'
+    )
+    subprocess.run([sys.executable, '-c', code], check=True)
+
+
+def test_missing_mdp_tells_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'mdp', None)
+    with pytest.raises(ConfigError, match=r'pip install "sfa_localization\[mdp\]"'):
+        mdp_shim.import_mdp()
