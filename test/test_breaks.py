@@ -99,6 +99,13 @@ def test_a_pose_that_jumps_goes_on_only_where_its_twist_says_so():
     assert 'jumps once, by up to 0.67 m: joined by its motion around' in text
     assert not joined.part.any()
     np.testing.assert_allclose(joined.poses, wheels.poses, atol=0.01)
+    often = wheels.poses
+    for at_s in range(3, 30, 3):
+        moved = compose(np.array([0.3, 0.2, 0.1]), often)
+        often = np.where(between(at_s, 31.0)[:, None], moved, often)
+    joined, text = parted(replace(wheels, poses=often))
+    assert 'jumps 9 times' in text and 'record the frame odom instead of map' in text
+    np.testing.assert_allclose(joined.poses, wheels.poses, atol=0.02)
     # Ticks that jump, of which the twist is made; and a driver that publishes no twist.
     at = int(np.flatnonzero(between(10.0, 30.0))[0])
     ticks = jumping.twists + np.outer(np.arange(len(STAMPS)) == at, [0.6 / 0.04, 0.0])

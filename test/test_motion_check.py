@@ -18,7 +18,6 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.data.errors import CameraError, DataError
-from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.run import Image, Odometry, PanoramaArray, Run, integrate
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
 from sfa_localization.metric.breaks import parted
@@ -189,17 +188,6 @@ def test_clocks_that_differ_are_corrected_or_reported(sample, tmp_path, late_s, 
     assert report.motion.pair(POSE, IMAGES).delay_s == pytest.approx(late_s, abs=0.03)
     assert text in report.as_text()
     assert any('synchronize' in lack for lack in report.lacks) == (abs(late_s) > 0.5)
-
-
-def test_odometry_that_jumps_and_turns_goes_on_as_before(sample):
-    odometry, rng = rows(sample.odometry, slice(None, None, 3)), np.random.default_rng(0)
-    poses, time_s = odometry.poses, (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
-    for at, jump in zip(np.arange(3.0, 32.0, 3.0), rng.normal(0, 0.3, (10, 3)), strict=True):
-        poses = np.where(time_s[:, None] < at, poses, compose(jump, poses))
-    joined, text = parted(replace(odometry, poses=poses))
-    assert 'jumps 10 times' in text and 'record the frame odom instead of map' in text
-    off = joined.poses - odometry.poses
-    assert np.abs(off[:, :2]).max() < 0.2 and np.abs(wrap_angle(off[:, 2])).max() < 0.05
 
 
 # The comparison itself, of drives whose motion is known.
