@@ -1,8 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closures: found in any light, right about the turn, a help even if some are wrong."""
+"""Loop closures, right in any light; how they and links of odometry bend graph and map."""
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,8 +17,11 @@ from sfa_localization.keyframes.closures import STRETCH_M, Closures, Textures, f
 from sfa_localization.keyframes.offsets import find_offsets
 from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.metric import selection
+from sfa_localization.metric.basis import Process
 from sfa_localization.metric.learning import learn_metric
+from sfa_localization.metric.links import Links
 from sfa_localization.metric.loops import rough_offsets, with_closures
+from sfa_localization.metric.map_fit import MetricProblem
 from sfa_localization.metric.pose_graph import Graph, cost, form_of, graph_poses, proof, refined
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -229,14 +233,98 @@ def test_a_segment_along_an_earlier_track_has_its_number_and_is_held_out_with_it
 def test_doors_of_a_corridor_that_look_alike_close_no_loop():
     run = drive(np.vstack([straight(30.0), turn(np.pi), straight(30.0)]), yaw_noise=0.01)
     segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
-    x = run.poses[:, 0]
-    back = int(np.argmax(x))
-    there = [int(np.argmin(np.abs(x[:back] - m))) for m in range(2, 28, 5)]
-    again = [back + int(np.argmin(np.abs(x[back:] - m))) for m in range(2, 28, 5)]
-    true = np.column_stack([there, again])
-    alike = np.column_stack([there[:-1], there[1:]])
+    there, back = np.arange(10, 140, 25), len(run.poses) - 1
+    true, alike = np.column_stack([there, back - there]), np.column_stack([there[:-1], there[1:]])
     closures = Closures(np.vstack([true, alike]), np.zeros(len(true) + len(alike)))
     assert with_closures(segments, closures).closures.images.tolist() == true.tolist()
+
+
+# --- links of odometry -------------------------------------------------------------------------
+
+
+def worse(segments, factor, seed=0):
+    """Displacements and turns with errors whose variances are a factor above the stated ones."""
+    rng = np.random.default_rng(seed)
+
+    def wrong(item):
+        if not item.linked:
+            return item
+        std = np.sqrt((factor - 1) * item.displacement_variance)
+        moved = item.displacement + std * complex(*rng.standard_normal(2))
+        turned = item.turn_rad + np.sqrt((factor - 1) * item.turn_variance) * rng.standard_normal()
+        return dataclasses.replace(item, displacement=moved, turn_rad=float(turned))
+
+    return dataclasses.replace(segments, items=tuple(wrong(item) for item in segments))
+
+
+@cache
+def recorded():
+    """A drive, its segments, features of its images, and the fit of them."""
+    twists, start = meander(250.0, seed=2)
+    run = drive(twists, start=start, yaw_noise=0.01, speed_noise=0.03, seed=2)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    features = garden_features(run.poses[:, :2], noise=0.05)
+    return run, segments, features, solved(segments, features)
+
+
+def solved(segments, features):
+    problem = MetricProblem.of(features, segments, MetricConfig())
+    rows = problem.features
+    scale = np.full(rows.shape[1], 1.0 / np.sqrt(rows.var(0).sum()))
+    return problem.fit(Process.fit(rows, scale, 1e-2, 300))
+
+
+def factors(fit):
+    """How many times the stated variance each link of a fit has: of turns, of displacements."""
+    names = 'turn_variance', 'displacement_variance'
+    return [getattr(fit.links, name) / getattr(fit.problem.links, name) for name in names]
+
+
+def map_error(fit):
+    """Mean error of a map, m."""
+    places = np.column_stack([fit.places.real, fit.places.imag])
+    truth = recorded()[0].poses[fit.stack.images, :2]
+    return np.hypot(*(align(places, truth).apply(places) - truth).T).mean()
+
+
+def test_links_that_err_by_more_than_they_say_weigh_less_for_the_good_of_the_map(
+    monkeypatch,
+):
+    _, segments, features, right = recorded()
+    for factor in factors(right):
+        assert 0.8 < np.median(factor) < 1.2 and factor.max() < 3.0
+    wrong = worse(segments, 16.0)
+    fit = solved(wrong, features)
+    for factor in factors(fit):
+        assert 5.0 < np.median(factor) < 25.0
+    monkeypatch.setattr(Links, 'learned', lambda stated, *_: stated)
+    assert map_error(fit) < 0.9 * map_error(solved(wrong, features))
+
+
+def test_a_wheel_that_slips_costs_single_links():
+    _, segments, features, right = recorded()
+    slipped = list(segments)
+    for n in (10, 40, 70):
+        slipped[n] = dataclasses.replace(slipped[n], displacement=slipped[n].displacement + 0.7)
+    fit = solved(dataclasses.replace(segments, items=tuple(slipped)), features)
+    (_, before), (_, move) = factors(right), factors(fit)
+    wrong = np.isin(fit.links.at, (10, 40, 70))
+    assert move[wrong].min() > 10.0
+    assert np.median(move[~wrong]) < 1.5 * np.median(before)
+
+
+def test_the_gram_is_what_eq_1_costs_at_the_best_map():
+    fit, rng = recorded()[3], np.random.default_rng(0)
+    stack, n, ridge = fit.stack, fit.stack.segments, fit.ridge
+    bias = 1e-3 * rng.normal(size=stack.period[-1] + 1)
+    z = np.exp(1j * rng.uniform(-3, 3, n))
+    poses = SegmentPoses(z, rng.normal(size=(n, 2)) @ [1, 1j], bias)
+    places, y = poses.places(stack), poses.coefficients(stack.period)
+    weights = ridge.fitted(places)
+    residuals = places - ridge.expanded @ weights
+    prior = ridge.basis.ridge @ np.abs(weights) ** 2
+    total = ridge.weights @ np.abs(residuals) ** 2 + prior
+    assert np.vdot(y, ridge.gram(stack) @ y).real == pytest.approx(total)
 
 
 # --- in the network ---------------------------------------------------------------------------
@@ -244,19 +332,17 @@ def test_doors_of_a_corridor_that_look_alike_close_no_loop():
 
 @pytest.mark.parametrize('config', [CONFIG, COUNTER])
 def test_an_edge_turns_the_second_image_to_the_heading_of_the_first(config):
-    world, rotations = Spheres.about(0), 12
-    turns = 2 * np.pi / config.width * np.array([0, 7, -30])
+    rotations, turns = 12, 2 * np.pi / config.width * np.array([0, 7, -30])
     first = np.array([[0.1, 0.2, 0.3], [0.5, -0.4, 2.0], [-1.0, 0.3, -2.0]])
-    second = first + np.column_stack([np.zeros((3, 2)), turns])
+    both = first, first + np.outer(turns, [0, 0, 1])
     drives = [
-        PanoramaArray(np.arange(3), world.panoramas(poses, config)) for poses in (first, second)
+        PanoramaArray(np.arange(3), Spheres.about(0).panoramas(poses, config)) for poses in both
     ]
     pairs = np.column_stack([np.arange(3), np.arange(3, 6)])
     (edges,) = edges_between(drives, Closures(pairs, turns), rotations, config.clockwise)
     images = edges.panoramas.read(0, 6)
-    step = config.width // rotations
     for a, b in zip(images[::2], images[1::2], strict=True):
-        ahead = np.roll(a, step, axis=1).astype(int)
+        ahead = np.roll(a, config.width // rotations, axis=1).astype(int)
         assert np.abs(b - ahead).mean() < 4.0
         assert np.abs(b - a.astype(int)).mean() > 10.0
     assert edges.joined.tolist() == [True, False, True, False, True]

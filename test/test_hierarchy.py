@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training the network: equal to the paper's explicit sequence, in shards, again and again."""
 
-import subprocess
 import sys
 
 import numpy as np
@@ -108,22 +107,6 @@ def test_the_engine_of_mdp_learns_the_same_features(relative_cut, mdp):
     assert_alike(ours.maps(images), theirs.maps(images), 0.9999)
     for pair in zip(ours.deltas, theirs.deltas, strict=True):
         assert np.allclose(*pair, rtol=2e-3)
-
-
-def test_the_shim_of_mdp_leaves_no_patch_behind(mdp):
-    """In a fresh interpreter."""
-    code = (
-        'import inspect, numpy\n'
-        'before = set(vars(numpy)), inspect.getfullargspec\n'
-        'from sfa_localization.sfa.mdp_shim import import_mdp\n'
-        'mdp = import_mdp()\n'
-        'assert import_mdp() is mdp\n'
-        'gone = set(vars(numpy)) - before[0]\n'
-        "assert 'typeDict' not in gone, gone\n"
-        'assert inspect.getfullargspec is before[1]\n'
-        'mdp.nodes.SFANode(output_dim=1).train(numpy.eye(9).cumsum(0))\n'
-    )
-    subprocess.run([sys.executable, '-c', code], check=True)
 
 
 def test_missing_mdp_tells_the_extra(monkeypatch):

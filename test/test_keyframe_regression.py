@@ -69,17 +69,12 @@ def test_a_place_between_keyframes_is_measured_whatever_the_rest_of_the_angle(co
     assert np.allclose(fit.place, place, atol=0.02)
 
 
-def test_what_no_place_explains_is_unlike_and_moves_little_and_no_texture_is_finite():
+def test_what_no_place_explains_is_unlike_and_moves_little():
     scene = KeyframeSquare()
     for share in (0.5, 1.0):
         fit = scene.fit((0.2, 0.1), share * scene.strange)
         assert fit.unlike == pytest.approx(share**2, rel=0.3)
         assert np.allclose(fit.place, (0.2, 0.1), atol=0.1)
-    for level in (0.0, 1.0):
-        same = np.repeat(spectrum(np.full((ROWS, 60), level, np.float32))[None], 64, axis=0)
-        fit = fit_among(same[0], same, scene.places, 60)
-        assert np.isfinite([*fit.place, *fit.changes, fit.unlike, fit.variance]).all()
-        assert np.abs(fit.place).max() <= 0.5
 
 
 NOISE = spectrum(2 * smooth(np.random.default_rng(9), 60))
@@ -96,15 +91,3 @@ def test_a_channel_that_shows_something_else_counts_little(spoil):
     fit = fit_among(image, keyframes, scene.places, 60, channels)
     assert np.hypot(*(fit.place - place)) < 0.03
     assert fit.unlike < 0.3 * plain.unlike
-
-
-@pytest.mark.parametrize(('columns', 'share'), [(60, 0.5), (61, 0.1)])
-def test_the_variance_is_what_light_moves_the_place_by(columns, share):
-    """A light that adds other things in each sector of 22.5 degrees."""
-    scene, rng, place, fits = KeyframeSquare(columns), np.random.default_rng(7), (0.1, -0.2), []
-    for _ in range(300):
-        sectors = np.repeat(rng.normal(size=(ROWS, 16)), 4, axis=1)[:, :columns]
-        light = normalized((sectors * rng.normal(1.0, 0.3, sectors.shape)).astype(np.float32))
-        fits.append(scene.fit(place, share * light))
-    true = np.mean([np.sum((fit.place - place) ** 2) for fit in fits]) / 2
-    assert 0.6 < np.mean([fit.variance for fit in fits]) / true < 1.7
