@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -17,7 +16,6 @@ from test_calibration_files import kalibr
 from sfa_localization import cli
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.calibration import (
-    ImageFiles,
     calibrate,
     check_image,
     find_circles,
@@ -101,22 +99,6 @@ def test_a_real_mirror_in_its_housing(count, turns):
 def test_an_ordinary_camera_has_no_circle(count, size):
     with pytest.raises(CameraError, match='3 or more, not 1' if count == 1 else 'others'):
         find_circles(list(ordinary(count, size=size)))
-
-
-def test_memory_does_not_grow_with_the_images(tmp_path):
-    """Of a few kB each, with 2 MB of pixels."""
-    paths = [tmp_path / f'{n}.png' for n in range(9)]
-    for n, path in enumerate(paths):
-        picture = np.full((800, 800, 3), 10, np.uint8)
-        cv2.circle(picture, (400, 400), 300, (100 + 10 * n,) * 3, -1)
-        cv2.imwrite(str(path), picture)
-    peaks = []
-    for count in (3, 9):
-        tracemalloc.start()
-        find_circles(ImageFiles(paths[:count]))
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[1] < peaks[0] + 2e6
 
 
 @pytest.fixture

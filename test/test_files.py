@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A file is there whole or not at all, whatever happens while it is written, and whoever writes."""
 
-import ast
 import errno
 import os
 import re
@@ -18,7 +17,6 @@ import numpy as np
 import pytest
 from test_calibration import scene
 
-import sfa_localization
 from sfa_localization.bags import writer as bag_writer
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.cli import main
@@ -28,16 +26,6 @@ from sfa_localization.data.files import atomic_write
 
 BAGS = Path(__file__).parents[1] / 'bags'
 FULL = OSError(errno.ENOSPC, 'No space left on device')
-
-
-# Who writes otherwise, and why it may.
-OTHERS = {
-    'bags/files': 'what is decompressed or salvaged, in a temporary folder',
-    'bags/writer': 'a folder, which is renamed when whole',
-    'data/files': 'the one writer',
-    'commands/live_nodes': 'what a program prints, while it prints it',
-    'cli': 'to /dev/null, what is printed to a closed stream',
-}
 
 
 @pytest.mark.parametrize('error', [ValueError(), KeyboardInterrupt(), FULL])
@@ -79,23 +67,6 @@ def test_what_is_no_regular_file_is_not_replaced_and_named(tmp_path):
         with refusal, atomic_write(tmp_path / name, DataError):
             raise AssertionError
     assert stat.S_ISFIFO((tmp_path / 'pipe').stat().st_mode)
-
-
-def test_files_are_written_by_atomic_write_alone():
-    writers = {'write_text', 'write_bytes', 'imwrite', 'tofile', 'savetxt', 'mkstemp', 'mkdtemp',
-               'rename', 'NamedTemporaryFile', 'truncate', 'fdopen'}  # fmt: skip
-    modules = set()
-    package = Path(sfa_localization.__file__).parent
-    for path in package.rglob('*.py'):
-        for call in ast.walk(ast.parse(path.read_text('utf-8'))):
-            if not isinstance(call, ast.Call):
-                continue
-            name = getattr(call.func, 'attr', getattr(call.func, 'id', ''))
-            modes = [a.value for a in call.args if isinstance(a, ast.Constant)]
-            opens = name == 'open' and any(m in ('w', 'wb', 'x', 'xb', 'a', 'ab') for m in modes)
-            if name in writers or opens:
-                modules.add(path.relative_to(package).with_suffix('').as_posix())
-    assert modules == set(OTHERS)
 
 
 @pytest.mark.parametrize('storage', bag_writer.STORAGES)

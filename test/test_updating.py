@@ -49,15 +49,15 @@ def map_of_truth():
     return align(run.odometry.poses[:, :2], np.array(places))
 
 
+def some_images(run):
+    return run.panoramas.read(0, len(run.panoramas))[::3]
+
+
 def errors(model, run):
     """Distances (N,) m of single images' positions from the truth."""
     places = [e.position for e in model.locate_all(some_images(run))]
     truth = map_of_truth().apply(run.odometry.poses[::3, :2])
     return np.hypot(*(np.array(places) - truth).T)
-
-
-def some_images(run):
-    return run.panoramas.read(0, len(run.panoramas))[::3]
 
 
 def test_what_a_changed_place_adds_lies_where_it_was_seen():
