@@ -15,11 +15,13 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from bag_formats import read_odometry
 from test_calibration import scene
 
 from sfa_localization import cli, training, tuning
 from sfa_localization.bags.reader import Bag
 from sfa_localization.data.errors import DataError, NodeError
+from sfa_localization.data.messages import read_yaw_rate
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation import drive as simulation
 
@@ -40,6 +42,11 @@ def options() -> dict[tuple[str, str], Any]:
 # Each option alone, on small inputs: what a command is given without it, and what comes of it.
 
 
+def rates(bag: Bag) -> list[float]:
+    """The yaw rates of a bag."""
+    return [omega for _, _, (omega, _) in bag.read([bag.stream('/imu', read_yaw_rate)])]
+
+
 @dataclass
 class Outcome:
     """What a command did: its exit code, what it printed, and the folder it may have written to."""
@@ -57,8 +64,8 @@ class Outcome:
                 'topics': [*bag.topics],
                 'truth': bag.trajectory().poses,
                 'stamps': bag.trajectory().stamps_ns,
-                'odometry': bag.odometry().poses,
-                'turns': bag.yaw_rate().omega if '/imu' in bag.topics else np.zeros(0),
+                'odometry': read_odometry(bag).poses,
+                'turns': rates(bag) if '/imu' in bag.topics else np.zeros(0),
                 'pictures': np.array([picture for _, picture in bag.images()]),
             }
 
@@ -355,7 +362,7 @@ def data(tmp_path_factory: pytest.TempPathFactory, gardens: None, small_network:
 def write_tables(folder: Path) -> None:
     """Write the test drive as the two logs of `filter`."""
     with Bag(folder / 'test') as bag:
-        odometry, truth = bag.odometry(), bag.trajectory()
+        odometry, truth = read_odometry(bag), bag.trajectory()
     rows = zip(odometry.stamps_ns * 1e-9, *odometry.twists.T, strict=True)
     lines = ['stamp_s,v_mps,omega_radps', *(f'{t:.3f},{v},{w}' for t, v, w in rows)]
     (folder / 'odom.csv').write_text('\n'.join(lines))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from metric_worlds import criss_cross, drive, lanes, meander
 
-from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.drives import read_drive
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.data.errors import CameraError, DataError
@@ -106,11 +106,11 @@ class Recorded:
 
 
 @pytest.fixture(scope='module')
-def sample() -> Recorded:
+def sample(tmp_path_factory) -> Recorded:
     """The sample's test drive."""
-    with Bag(Path(__file__).parents[1] / 'bags/sample_test') as bag:
-        images, odometry = list(bag.images()), bag.odometry()
-        return Recorded(images, odometry, bag.yaw_rate())
+    run = read_drive(Path(__file__).parents[1] / 'bags/sample_test', tmp_path_factory.mktemp('run'))
+    images = zip(run.panoramas.stamps_ns.tolist(), run.panoramas.images, strict=True)
+    return Recorded([*images], run.odometry, run.yaw_rate)
 
 
 def inspected(recorded: Recorded, bag: Path, **how) -> BagReport:
