@@ -11,6 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import pytest
+from bag_formats import read_odometry
 from test_calibration import scene
 
 from sfa_localization import cli, training, tuning
@@ -190,7 +191,7 @@ def data(tmp_path_factory, gardens, small_network):
     cv2.imwrite(str(folder / 'mirror.png'), scene(1))
     # The logs of `filter`.
     with Bag(folder / 'test') as bag:
-        odometry, truth = bag.odometry(), bag.trajectory()
+        odometry, truth = read_odometry(bag), bag.trajectory()
     for name, columns, stamps_ns, rows in (
         ('odom', 'stamp_s,v_mps,omega_radps', odometry.stamps_ns, odometry.twists),
         ('positions', 'stamp_s,x_m,y_m,yaw_rad', truth.stamps_ns[::5], truth.poses[::5]),

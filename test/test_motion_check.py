@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from metric_worlds import criss_cross, drive, lanes, meander
 
-from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.drives import read_drive
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.data.errors import CameraError, DataError
@@ -69,12 +69,11 @@ def gyro(run: Run, factor=1.0, late_s=0.0) -> Run:
 
 
 @pytest.fixture(scope='module')
-def sample() -> Run:
+def sample(tmp_path_factory) -> Run:
     """The sample's test drive."""
-    with Bag(Path(__file__).parents[1] / 'bags/sample_test') as bag:
-        stamps_ns, images = zip(*bag.images(), strict=True)
-        panoramas = PanoramaArray(np.array(stamps_ns), np.stack(images))
-        return Run('drive', panoramas, bag.odometry(), bag.yaw_rate())
+    run = read_drive(Path(__file__).parents[1] / 'bags/sample_test', tmp_path_factory.mktemp('run'))
+    images = PanoramaArray(run.panoramas.stamps_ns, np.array(run.panoramas.images))
+    return replace(run, name='drive', panoramas=images)
 
 
 def checked(run: Run, force: bool = False):

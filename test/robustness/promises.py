@@ -59,7 +59,7 @@ PROMISES = {
         ('a place outside of the training', 'images are rejected as unlike those of training'),
     'test_omnicam_node.py::test_a_silent_camera_shows_in_diagnostics':
         ('a camera that falls silent', '`/diagnostics` says for how long'),
-    'test_sources.py::test_a_defect_in_the_thread_is_reported_and_the_source_opened_again':
+    'test_capture.py::test_a_defect_in_the_thread_is_reported_and_the_source_opened_again':
         ('an exception while a camera is read', 'the camera is opened again'),
     'test_health.py::test_each_fault_is_found_with_its_size_and_named':
         ('a camera that was moved or turned', 'DEGRADED, with the distance or angle'),
