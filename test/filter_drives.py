@@ -3,12 +3,13 @@
 """Simulated drives for the filter's tests: a true path, odometry and images with given errors."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.run import integrate
+from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import PoseFilter
 
 SECOND, START_NS = 1_000_000_000, 1_700_000_000_000_000_000
@@ -58,10 +59,18 @@ def from_rest(twists, rate_hz=50.0, standing_s=0.6, faster_s=0.4):
     return twists * np.clip((t - standing_s) / faster_s, 0.0, 1.0)[:, None]
 
 
+def lasting(rng, fades, size):
+    """Unit errors (N, size), each of which correlates with that before it by its factor (N,)."""
+    errors = rng.standard_normal((len(fades), size))
+    for k, fade in enumerate(fades[1:], 1):
+        errors[k] = fade * errors[k - 1] + math.sqrt(1 - fade**2) * errors[k]
+    return errors
+
+
 @dataclass
 class FilterDrive:
     """A drive to be fed to a filter: odometry in order, an image every `every` samples with the
-    covariance of its errors, or of `claimed_m`.
+    covariance of its errors.
     """
 
     seconds: float = 30.0
@@ -77,41 +86,33 @@ class FilterDrive:
     scale: float = 1.0
     share: float = 0.0
     length: float = 0.6
-    claimed_m: float | None = None
     seed: int = 0
-    stamps_ns: np.ndarray = field(init=False)
 
     def __post_init__(self):
         if self.twists is None:
             self.twists = winding(self.seconds, self.rate_hz)
-        rng = np.random.default_rng(self.seed)
-        count = len(self.twists)
+        rng, count = np.random.default_rng(self.seed), len(self.twists)
         self.stamps_ns = stamps(count, self.rate_hz)
-        # Each twist has been held since the stamp before.
-        self.poses = integrate(self.stamps_ns, self.twists, np.array(self.start, float))
-        self.read = self.twists / [self.scale, 1.0] + [0.0, self.bias]
-        self.read = self.read + rng.standard_normal((count, 2)) * [self.v_std, self.omega_std]
+        self.read, self.poses = self._driven(rng)
         # The robot was switched on somewhere else, and its odometry's pose drifts as its twist.
         elsewhere = np.random.default_rng([self.seed, 1])
         switched_on = np.array([*elsewhere.uniform(-20, 20, 2), elsewhere.uniform(-3, 3)])
         self.reckoned = integrate(self.stamps_ns, self.read, switched_on)
         self.pictures = np.arange(self.every, count, self.every)
-        self.seen = self._seen(rng)
+        moved = np.cumsum(np.abs(self.twists) @ [1, TURN_RADIUS_M])[self.pictures] / self.rate_hz
+        errors = math.sqrt(self.share) * lasting(
+            rng, np.exp(-np.diff(moved, prepend=0) / self.length), 3
+        )
+        errors += math.sqrt(1 - self.share) * rng.standard_normal(errors.shape)
+        self.seen = self.poses[self.pictures]
+        self.seen += errors * [self.position_std, self.position_std, self.yaw_std]
+        self.seen[:, 2] = wrap_angle(self.seen[:, 2])
 
-    def _seen(self, rng):
-        poses = self.poses[self.pictures]
-        way = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
-        lasting = rng.standard_normal(3)
-        errors = []
-        for step in way:
-            fade = math.exp(-step / self.length)
-            lasting = fade * lasting + math.sqrt(1 - fade**2) * rng.standard_normal(3)
-            white = math.sqrt(1 - self.share) * rng.standard_normal(3)
-            errors.append(math.sqrt(self.share) * lasting + white)
-        stds = [self.position_std, self.position_std, self.yaw_std]
-        seen = poses + np.array(errors) * stds
-        seen[:, 2] = wrap_angle(seen[:, 2])
-        return seen
+    def _driven(self, rng):
+        """Twists as they are read, and true poses; each twist was held since the stamp before."""
+        noise = rng.standard_normal(self.twists.shape) * [self.v_std, self.omega_std]
+        read = self.twists / [self.scale, 1.0] + [0.0, self.bias] + noise
+        return read, integrate(self.stamps_ns, self.twists, np.array(self.start, float))
 
     def kidnap(self, picture, shift):
         """From this picture on, the robot drives the same way elsewhere: shift is (x, y, yaw)."""
@@ -124,8 +125,6 @@ class FilterDrive:
 
     def covariance(self, heading):
         position, yaw = max(self.position_std, 0.05), max(self.yaw_std, 0.02)
-        if self.claimed_m is not None:
-            position, yaw = self.claimed_m, self.claimed_m / 10
         return np.diag(np.square([position, position, yaw][: 3 if heading else 2]))
 
     def events(self):

@@ -95,7 +95,7 @@ def test_images_that_are_stamped_late_are_no_noise_and_unusable_ones_do_not_coun
     costs = [tuning.likelihood_cost([each], config) for each in drives]
     errors = [tuning.error_cost([each], config) for each in drives]
     # Without turns the filter learns the delay from the way alone, later.
-    assert costs[1] == pytest.approx(costs[0]) and costs[1] < costs[2] < costs[3]
+    assert costs[1] == pytest.approx(costs[0]) and costs[1] < costs[3]
     assert errors[1] < 1.2 * errors[0] and errors[2] < 0.5 * errors[3], errors
     unusable = {'problem': 'dark', 'covariance': unusable_covariance()}
     dark = [replace(image, **unusable, stamp_ns=image.stamp_ns + 1) for image in plain.observations]
