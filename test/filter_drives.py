@@ -38,11 +38,6 @@ def snapshot(fused):
     return state.stamp_ns, state.mean.tolist(), state.covariance.tolist()
 
 
-def seconds_of(event):
-    """Of the drive."""
-    return (event[0] - START_NS) * 1e-9
-
-
 def stamps(count, rate_hz, start_ns=START_NS):
     return start_ns + np.round(np.arange(count) * 1e9 / rate_hz).astype(np.int64)
 
@@ -100,10 +95,9 @@ class FilterDrive:
         self.reckoned = integrate(self.stamps_ns, self.read, switched_on)
         self.pictures = np.arange(self.every, count, self.every)
         moved = np.cumsum(np.abs(self.twists) @ [1, TURN_RADIUS_M])[self.pictures] / self.rate_hz
-        errors = math.sqrt(self.share) * lasting(
-            rng, np.exp(-np.diff(moved, prepend=0) / self.length), 3
-        )
-        errors += math.sqrt(1 - self.share) * rng.standard_normal(errors.shape)
+        shared = lasting(rng, np.exp(-np.diff(moved, prepend=0) / self.length), 3)
+        white = rng.standard_normal(shared.shape)
+        errors = math.sqrt(self.share) * shared + math.sqrt(1 - self.share) * white
         self.seen = self.poses[self.pictures]
         self.seen += errors * [self.position_std, self.position_std, self.yaw_std]
         self.seen[:, 2] = wrap_angle(self.seen[:, 2])
@@ -116,22 +110,20 @@ class FilterDrive:
 
     def kidnap(self, picture, shift):
         """From this picture on, the robot drives the same way elsewhere: shift is (x, y, yaw)."""
-        sample = self.pictures[picture]
-        offset = self.seen[:, 2] - self.poses[self.pictures, 2]
-        error = self.seen[:, :2] - self.poses[self.pictures, :2]
-        self.poses[sample:] = compose(np.array(shift, float), self.poses[sample:])
-        moved = self.poses[self.pictures]
-        self.seen = np.column_stack([moved[:, :2] + error, wrap_angle(moved[:, 2] + offset)])
+        for poses, first in ((self.poses, self.pictures[picture]), (self.seen, picture)):
+            poses[first:] = compose(np.array(shift), poses[first:])
 
     def covariance(self, heading):
         position, yaw = max(self.position_std, 0.05), max(self.yaw_std, 0.02)
         return np.diag(np.square([position, position, yaw][: 3 if heading else 2]))
 
-    def events(self):
-        """(stamp, kind, index) in order; odometry before the picture of the same stamp."""
-        listed = [(int(s), 0, i) for i, s in enumerate(self.stamps_ns)]
-        listed += [(int(self.stamps_ns[i]), 1, k) for k, i in enumerate(self.pictures)]
-        return sorted(listed)
+    def events(self, start=0, stop=math.inf):
+        """(stamp, kind, index) in order, of seconds [start, stop); odometry before the picture of
+        the same stamp.
+        """
+        listed = [(s, 0, i) for i, s in enumerate(self.stamps_ns.tolist())]
+        listed += [(s, 1, k) for k, s in enumerate(self.stamps_ns[self.pictures].tolist())]
+        return sorted(each for each in listed if start <= (each[0] - START_NS) * 1e-9 < stop)
 
     def give(self, fused, event, heading=False):
         stamp_ns, kind, index = event
@@ -143,15 +135,14 @@ class FilterDrive:
     def variances(self):
         return max(self.v_std, 1e-6) ** 2, max(self.omega_std, 1e-6) ** 2
 
-    def feed(self, fused, heading=False, start=0, stop=None, pictures=True):
+    def feed(self, fused, heading=False, start=0, stop=math.inf, pictures=True):
         """Feed seconds [start, stop); per picture: (index, update, error, yaw error)."""
         outcomes = []
-        for event in self.events():
-            t = seconds_of(event)
-            if t < start or (stop is not None and t >= stop) or (event[1] and not pictures):
-                continue
-            update = self.give(fused, event, heading)
-            if event[1]:
+        for event in self.events(start, stop):
+            if not event[1]:
+                self.give(fused, event)
+            elif pictures:
+                update = self.give(fused, event, heading)
                 outcomes.append((event[2], update, *self.error(fused, self.pictures[event[2]])))
         return outcomes
 
