@@ -115,8 +115,8 @@ class Graph:
 
     @classmethod
     def at(cls, form: Any, stack: Stack, poses: SegmentPoses) -> Graph:
-        """Of poses at a minimum."""
-        factor, _ = _normal(form, poses, stack.period)
+        """Of poses at a minimum, with a covariance at the biases."""
+        factor, _ = _normal(form, poses, stack.period, 1e-6 * YAW_BIAS_STD)
         return cls(stack, poses, proof(form, poses, stack.period), factor)
 
     def covariance_times(self, columns: Array) -> Array:
@@ -247,16 +247,20 @@ def derivative(poses: SegmentPoses, period: Indices) -> Any:
     ).tocsr()
 
 
-def _gauss_newton(form: Any, poses: SegmentPoses, period: Indices) -> Any:
+def _gauss_newton(
+    form: Any, poses: SegmentPoses, period: Indices, bias_std: float = YAW_BIAS_STD
+) -> Any:
     """The normal equations (P, P). A rotation of all segments costs nothing: the first direction
     is held."""
     n, by = len(period), derivative(poses, period)
-    prior = np.repeat([0.0, _DIRECTION_PRIOR, YAW_BIAS_STD**-2], [2 * n, n, len(poses.bias)])
+    prior = np.repeat([0.0, _DIRECTION_PRIOR, bias_std**-2], [2 * n, n, len(poses.bias)])
     prior[2 * n] = 1.0
     return (by.conj().T @ form @ by).real + sparse.diags_array(prior)
 
 
-def _normal(form: Any, poses: SegmentPoses, period: Indices) -> tuple[SuperLU, Array]:
+def _normal(
+    form: Any, poses: SegmentPoses, period: Indices, bias_std: float = YAW_BIAS_STD
+) -> tuple[SuperLU, Array]:
     """The factor of half the Hessian of the cost, or of Gauss and Newton's where that is not
     positive, and half the gradient (P,)."""
     n, y = len(period), poses.coefficients(period)
@@ -267,7 +271,7 @@ def _normal(form: Any, poses: SegmentPoses, period: Indices) -> tuple[SuperLU, A
     mixed = np.real(1j * poses.z.conj() * pull[2 * n :])
     angles, biases = 2 * n + np.arange(n), 3 * n + period
     at = np.concatenate([angles, angles, biases]), np.concatenate([angles, biases, angles])
-    gauss_newton = _gauss_newton(form, poses, period)
+    gauss_newton = _gauss_newton(form, poses, period, bias_std)
     values = np.concatenate([curvature, mixed, mixed])
     factor = _factor(gauss_newton + sparse.csr_array((values, at), gauss_newton.shape))
     if factor.U.diagonal().min() <= 0.0:

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from scipy import optimize
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices, align_complex
@@ -33,10 +33,9 @@ HELD_OUT_LENGTH_M = 10.0
 """Longest stretch that is held out as a whole: a covered area has no longer gaps."""
 # Inducing points of the search: with 300 it ends with too much noise.
 _SEARCH_POINTS = 800
-# Start and bounds of length (in typical distances of two images) and noise (over the signal): with
-# less, rounded models err.
+# Start and bounds of length (in typical distances of two images) and noise (over the signal).
 _FIRST_HYPER = (1.0, 1e-3)
-_BOUNDS = ((0.05, 20.0), (1e-5, 1.0))
+_BOUNDS = ((0.05, 20.0), (1e-6, 1.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,15 +199,21 @@ def choose(problem: MetricProblem, scale: Array | None = None) -> MapFit:
 
 
 def _searched(judge: Callable[[float, float], float]) -> tuple[float, float]:
-    """Length and noise of the least cost, to about 20 %."""
-    start = np.log(_FIRST_HYPER)
-    simplex = start + np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 1.4]])
-    best = optimize.minimize(
-        lambda logarithms: judge(*np.exp(logarithms).tolist()),
-        start,
-        method='Nelder-Mead',
-        bounds=np.log(_BOUNDS),
-        options={'initial_simplex': simplex, 'xatol': 0.2, 'fatol': np.inf},
-    )
-    length, noise = np.exp(best.x).tolist()
-    return length, noise
+    """Length and noise by coordinate descent in factors of 2, then 1.4."""
+    cost = cache(judge)
+    best = _FIRST_HYPER
+    for factor in (2.0, 1.4):
+        while True:
+            length, noise = best
+            steps = [(length * factor, noise), (length / factor, noise)]
+            steps += [(length, noise * factor**2), (length, noise / factor**2)]
+            inside = [
+                (length, noise)
+                for length, noise in steps
+                if _BOUNDS[0][0] < length < _BOUNDS[0][1] and _BOUNDS[1][0] < noise < _BOUNDS[1][1]
+            ]
+            better = min(inside, key=lambda hyper: cost(*hyper))
+            if not cost(*better) < cost(*best):
+                break
+            best = better
+    return best
