@@ -306,15 +306,6 @@ def test_one_picture_with_heading_starts_at_once_and_one_that_is_wrong_is_outvot
     assert outcomes[0][1].accepted and not outcomes[1][1].accepted and outcomes[3][2] < 0.8
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_without_heading_the_first_meters_start_it(seed):
-    drive = FilterDrive(seconds=8, start=(4.0, -3.0, 2.0 + seed), **NOISY, seed=seed)
-    outcomes = drive.feed(PoseFilter())
-    started = next(k for k, (_, update, _, _) in enumerate(outcomes) if update.accepted)
-    assert drive.pictures[started] / 50 < 3.0
-    assert abs(outcomes[-1][3]) < 0.3 and outcomes[-1][2] < 0.8
-
-
 @pytest.mark.parametrize('stds', [(2.5, 0.1, 0.1), (0.1, 2.5, 0.1), (0.1, 0.1, 0.9)])
 def test_an_uncertain_image_does_not_start_the_filter(stds):
     fused = PoseFilter()
