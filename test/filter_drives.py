@@ -3,12 +3,13 @@
 """Simulated drives for the filter's tests: a true path, odometry and images with given errors."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.run import integrate
+from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import PoseFilter
 
 SECOND, START_NS = 1_000_000_000, 1_700_000_000_000_000_000
@@ -37,11 +38,6 @@ def snapshot(fused):
     return state.stamp_ns, state.mean.tolist(), state.covariance.tolist()
 
 
-def seconds_of(event):
-    """Of the drive."""
-    return (event[0] - START_NS) * 1e-9
-
-
 def stamps(count, rate_hz, start_ns=START_NS):
     return start_ns + np.round(np.arange(count) * 1e9 / rate_hz).astype(np.int64)
 
@@ -58,10 +54,18 @@ def from_rest(twists, rate_hz=50.0, standing_s=0.6, faster_s=0.4):
     return twists * np.clip((t - standing_s) / faster_s, 0.0, 1.0)[:, None]
 
 
+def lasting(rng, fades, size):
+    """Unit errors (N, size), each of which correlates with that before it by its factor (N,)."""
+    errors = rng.standard_normal((len(fades), size))
+    for k, fade in enumerate(fades[1:], 1):
+        errors[k] = fade * errors[k - 1] + math.sqrt(1 - fade**2) * errors[k]
+    return errors
+
+
 @dataclass
 class FilterDrive:
     """A drive to be fed to a filter: odometry in order, an image every `every` samples with the
-    covariance of its errors, or of `claimed_m`.
+    covariance of its errors.
     """
 
     seconds: float = 30.0
@@ -77,62 +81,49 @@ class FilterDrive:
     scale: float = 1.0
     share: float = 0.0
     length: float = 0.6
-    claimed_m: float | None = None
     seed: int = 0
-    stamps_ns: np.ndarray = field(init=False)
 
     def __post_init__(self):
         if self.twists is None:
             self.twists = winding(self.seconds, self.rate_hz)
-        rng = np.random.default_rng(self.seed)
-        count = len(self.twists)
+        rng, count = np.random.default_rng(self.seed), len(self.twists)
         self.stamps_ns = stamps(count, self.rate_hz)
-        # Each twist has been held since the stamp before.
-        self.poses = integrate(self.stamps_ns, self.twists, np.array(self.start, float))
-        self.read = self.twists / [self.scale, 1.0] + [0.0, self.bias]
-        self.read = self.read + rng.standard_normal((count, 2)) * [self.v_std, self.omega_std]
+        self.read, self.poses = self._driven(rng)
         # The robot was switched on somewhere else, and its odometry's pose drifts as its twist.
         elsewhere = np.random.default_rng([self.seed, 1])
         switched_on = np.array([*elsewhere.uniform(-20, 20, 2), elsewhere.uniform(-3, 3)])
         self.reckoned = integrate(self.stamps_ns, self.read, switched_on)
         self.pictures = np.arange(self.every, count, self.every)
-        self.seen = self._seen(rng)
+        moved = np.cumsum(np.abs(self.twists) @ [1, TURN_RADIUS_M])[self.pictures] / self.rate_hz
+        shared = lasting(rng, np.exp(-np.diff(moved, prepend=0) / self.length), 3)
+        white = rng.standard_normal(shared.shape)
+        errors = math.sqrt(self.share) * shared + math.sqrt(1 - self.share) * white
+        self.seen = self.poses[self.pictures]
+        self.seen += errors * [self.position_std, self.position_std, self.yaw_std]
+        self.seen[:, 2] = wrap_angle(self.seen[:, 2])
 
-    def _seen(self, rng):
-        poses = self.poses[self.pictures]
-        way = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
-        lasting = rng.standard_normal(3)
-        errors = []
-        for step in way:
-            fade = math.exp(-step / self.length)
-            lasting = fade * lasting + math.sqrt(1 - fade**2) * rng.standard_normal(3)
-            white = math.sqrt(1 - self.share) * rng.standard_normal(3)
-            errors.append(math.sqrt(self.share) * lasting + white)
-        stds = [self.position_std, self.position_std, self.yaw_std]
-        seen = poses + np.array(errors) * stds
-        seen[:, 2] = wrap_angle(seen[:, 2])
-        return seen
+    def _driven(self, rng):
+        """Twists as they are read, and true poses; each twist was held since the stamp before."""
+        noise = rng.standard_normal(self.twists.shape) * [self.v_std, self.omega_std]
+        read = self.twists / [self.scale, 1.0] + [0.0, self.bias] + noise
+        return read, integrate(self.stamps_ns, self.twists, np.array(self.start, float))
 
     def kidnap(self, picture, shift):
         """From this picture on, the robot drives the same way elsewhere: shift is (x, y, yaw)."""
-        sample = self.pictures[picture]
-        offset = self.seen[:, 2] - self.poses[self.pictures, 2]
-        error = self.seen[:, :2] - self.poses[self.pictures, :2]
-        self.poses[sample:] = compose(np.array(shift, float), self.poses[sample:])
-        moved = self.poses[self.pictures]
-        self.seen = np.column_stack([moved[:, :2] + error, wrap_angle(moved[:, 2] + offset)])
+        for poses, first in ((self.poses, self.pictures[picture]), (self.seen, picture)):
+            poses[first:] = compose(np.array(shift), poses[first:])
 
     def covariance(self, heading):
         position, yaw = max(self.position_std, 0.05), max(self.yaw_std, 0.02)
-        if self.claimed_m is not None:
-            position, yaw = self.claimed_m, self.claimed_m / 10
         return np.diag(np.square([position, position, yaw][: 3 if heading else 2]))
 
-    def events(self):
-        """(stamp, kind, index) in order; odometry before the picture of the same stamp."""
-        listed = [(int(s), 0, i) for i, s in enumerate(self.stamps_ns)]
-        listed += [(int(self.stamps_ns[i]), 1, k) for k, i in enumerate(self.pictures)]
-        return sorted(listed)
+    def events(self, start=0, stop=math.inf):
+        """(stamp, kind, index) in order, of seconds [start, stop); odometry before the picture of
+        the same stamp.
+        """
+        listed = [(s, 0, i) for i, s in enumerate(self.stamps_ns.tolist())]
+        listed += [(s, 1, k) for k, s in enumerate(self.stamps_ns[self.pictures].tolist())]
+        return sorted(each for each in listed if start <= (each[0] - START_NS) * 1e-9 < stop)
 
     def give(self, fused, event, heading=False):
         stamp_ns, kind, index = event
@@ -144,15 +135,14 @@ class FilterDrive:
     def variances(self):
         return max(self.v_std, 1e-6) ** 2, max(self.omega_std, 1e-6) ** 2
 
-    def feed(self, fused, heading=False, start=0, stop=None, pictures=True):
+    def feed(self, fused, heading=False, start=0, stop=math.inf, pictures=True):
         """Feed seconds [start, stop); per picture: (index, update, error, yaw error)."""
         outcomes = []
-        for event in self.events():
-            t = seconds_of(event)
-            if t < start or (stop is not None and t >= stop) or (event[1] and not pictures):
-                continue
-            update = self.give(fused, event, heading)
-            if event[1]:
+        for event in self.events(start, stop):
+            if not event[1]:
+                self.give(fused, event)
+            elif pictures:
+                update = self.give(fused, event, heading)
                 outcomes.append((event[2], update, *self.error(fused, self.pictures[event[2]])))
         return outcomes
 

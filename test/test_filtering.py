@@ -37,21 +37,6 @@ def write_logs(folder, drive, head='stamp_s,v_mps,omega_radps', sep=',', varianc
     return paths
 
 
-def at(folder, *pose):
-    """Options that set the initial pose."""
-    (folder / 'start.yaml').write_text(
-        f'ekf_node: {{ros__parameters: {{initial_pose: {[*pose]}}}}}'
-    )
-    return '--config', str(folder / 'start.yaml')
-
-
-def run(folder, drive, *options, **how):
-    """The exit code of the command on a drive, and the stamps and poses that it wrote."""
-    logs, output = write_logs(folder, drive, **how), folder / 'out.tum'
-    code = main(['filter', *map(str, logs), '--output', str(output), *options])
-    return code, read_tum(output) if code == 0 else None
-
-
 def read_tum(path):
     rows = [line.split() for line in path.read_text().splitlines()]
     stamps = np.array([int(s) * 10**9 + int(f) for s, f in (row[0].split('.') for row in rows)])
@@ -71,17 +56,11 @@ def alone(drive):
     return np.hypot(*(drive.seen[:, :2] - drive.poses[drive.pictures, :2]).T).mean()
 
 
-def tables(drive, variance=math.nan):
-    stamps = drive.stamps_ns[drive.pictures]
-    positions = np.full((len(stamps), len(POSITIONS) - 1), np.nan)
-    positions[:, :2], positions[:, 2:4] = drive.seen[:, :2], variance
-    twists = np.column_stack([drive.read, np.full((len(drive.read), 2), np.nan)])
-    return Table(drive.stamps_ns, twists), Table(stamps, positions)
-
-
 def test_the_command_writes_what_the_live_filter_would_have_said(tmp_path):
     drive = FilterDrive(seconds=20, **NOISY, seed=1)
-    code, (stamps, poses) = run(tmp_path, drive)
+    logs, output = write_logs(tmp_path, drive), tmp_path / 'out.tum'
+    assert main(['filter', *map(str, logs), '--output', str(output)]) == 0
+    stamps, poses = read_tum(output)
     live, said = PoseFilter(FilterConfig(), ErrorCorrelation(share=0.0)), {}
     for stamp_ns, kind, index in drive.events():
         if kind:
@@ -90,7 +69,7 @@ def test_the_command_writes_what_the_live_filter_would_have_said(tmp_path):
             live.add_odometry(stamp_ns, *drive.read[index])
         if live.state is not None:
             said[stamp_ns] = live.at(stamp_ns).pose
-    assert code == 0 and set(stamps) == set(said) and len(stamps) > 850
+    assert set(stamps) == set(said) and len(stamps) > 850
     assert max(np.abs(said[s][:2] - p[:2]).max() for s, p in zip(stamps, poses, strict=True)) < 1e-5
     lines = (tmp_path / 'out.covariance.csv').read_text().splitlines()
     assert lines[0] == 'stamp_s,var_x,cov_xy,cov_xyaw,var_y,cov_yyaw,var_yaw'
@@ -99,21 +78,10 @@ def test_the_command_writes_what_the_live_filter_would_have_said(tmp_path):
     assert np.all(cells[:, [0, 3, 5]] > 0)
 
 
-def test_it_starts_from_a_pose_or_the_way_and_beats_the_positions(tmp_path):
-    drive = FilterDrive(seconds=60, start=(500.0, -200.0, 2.5), **NOISY)
-    _, written = run(tmp_path, drive)
-    assert errors(drive, *written).mean() < 0.6 * alone(drive)
-    drive = FilterDrive(seconds=10, start=(1.0, 2.0, -3.0), **NOISY)
-    _, written = run(tmp_path, drive, *at(tmp_path, 1.0, 2.0, -3.0))
-    assert len(written[0]) == len(drive.stamps_ns) and errors(drive, *written).max() < 0.6
-
-
 def test_headers_and_separators_of_all_kinds_read_alike_and_nanoseconds_survive(tmp_path):
     drive, path = FilterDrive(seconds=2), tmp_path / 'p.csv'
     for how in (
-        {'head': ''}, {'head': '# a remark\nstamp_s, v_mps , omega_radps'},
-        {'head': '"stamp_s","v_mps","omega_radps"'}, {'sep': '\t'},
-        {'sep': ' ', 'head': 'stamp_s v_mps omega_radps'},
+        {'head': ''}, {'head': '# a remark\nstamp_s, v_mps , "omega_radps"'}, {'sep': '\t'},
         {'sep': ';', 'head': 'stamp_s;v_mps;omega_radps'},
     ):  # fmt: skip
         table = read_table(write_logs(tmp_path, drive, **how)[0], ODOMETRY)
@@ -152,16 +120,12 @@ def test_a_heading_with_its_variance_starts_the_filter(tmp_path):
     assert done.poses[-1] == pytest.approx([5, 6, 1.5])
 
 
-def test_gaps_missing_variances_and_stamps_from_zero_or_below_are_survived():
-    drive, cut = FilterDrive(seconds=90, rate_hz=10, every=5, **NOISY), []
-    for table, (first, last) in zip(tables(drive), ((30e9, 45e9), (50e9, 70e9)), strict=True):
-        kept = abs(table.stamps_ns - START_NS - (first + last) / 2) > (last - first) / 2
-        cut.append(Table(table.stamps_ns[kept], table.values[kept]))
-    done = run_filter(*cut, FilterConfig())
-    assert errors(drive, done.stamps_ns, done.poses)[-100:].mean() < 0.3
+def test_missing_variances_and_stamps_from_zero_or_below_are_survived(tmp_path):
+    drive = FilterDrive(seconds=60, rate_hz=10, every=5, **NOISY)
+    odometry, positions = write_logs(tmp_path, drive, variance=False)
+    tables = read_table(odometry, ODOMETRY), read_table(positions, POSITIONS)
     for shift in (-START_NS, -START_NS - 10**12):
-        moved = [table._replace(stamps_ns=table.stamps_ns + shift) for table in tables(drive)]
-        done = run_filter(*moved, STARTED)
+        done = run_filter(*(t._replace(stamps_ns=t.stamps_ns + shift) for t in tables), STARTED)
         assert len(done.stamps_ns) == len(drive.stamps_ns)
         assert errors(drive, done.stamps_ns, done.poses, shift).mean() < 0.5 * alone(drive)
 
@@ -172,7 +136,6 @@ ROW = 'stamp_s,x_m,y_m\n1,2,3\n'
 @pytest.mark.parametrize(('odometry', 'positions', 'why'), [
     ('', ROW, 'none of its 0 rows'),
     ('stamp_s,v_mps\n1,2\n', ROW, 'no column omega_radps among stamp_s, v_mps'),
-    ('a,b,c\n1,2,3\n', ROW, 'no column stamp_s among a, b, c'),
     ('stamp_s,\x1b[31mv,omega\n0,1,0\n', ROW, 'no column v_mps among stamp_s, ?[31mv, omega'),
     ('stamp_s,v_mps,omega_radps\nx,y,z\n', ROW, 'none of its 1 rows has stamp_s, v_mps and omega'),
     ('stamp_s,v_mps,omega_radps\n1700000000000,1,0\n', ROW, 'in these units'),
@@ -191,7 +154,7 @@ def test_logs_that_cannot_be_used_are_named_in_one_line(tmp_path, capsys, odomet
     assert not (tmp_path / 'out.tum').exists() and len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_log_that_is_no_file_or_never_ends_and_a_wrong_start_are_one_error_line(tmp_path, capsys):
+def test_a_log_that_is_no_file_or_never_ends_is_one_error_line(tmp_path, capsys):
     """A pipe would wait for its writer, and a device fill the memory."""
     os.mkfifo(tmp_path / 'pipe.csv')
     positions, output = tmp_path / 'positions.csv', str(tmp_path / 'o.tum')
@@ -200,8 +163,6 @@ def test_a_log_that_is_no_file_or_never_ends_and_a_wrong_start_are_one_error_lin
         assert main(['filter', str(odometry), str(positions), '--output', output]) == 1
         lines = capsys.readouterr().err.strip().splitlines()
         assert len(lines) == 1 and f'{odometry}: cannot be read' in lines[0]
-    assert run(tmp_path, FilterDrive(seconds=1), *at(tmp_path, 1e9, 0.0, 0.0))[0] == 1
-    assert 'initial_pose: 1000000000.0 is outside' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('name', ['odom.csv', 'link.csv', 'positions.csv', 'poses.tum'])

@@ -67,14 +67,13 @@ def drive(
     return track, images
 
 
-@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('turn', [0.0, 0.5])
 @pytest.mark.parametrize('heading', [True, False])
-def test_where_all_is_well_two_meters_are_enough(heading, turn, seed):
+def test_where_all_is_well_two_meters_are_enough(heading, turn):
     for seconds in (2.6, 5.0, 30.0):
-        health = health_of(*drive(seconds, turn, seed=seed, heading=heading))
+        health = health_of(*drive(seconds, turn, heading=heading))
         assert health.well > LIKELY and health.problems == []
-    assert health_of(*drive(1.0, seed=seed)).problems  # not confirmed yet
+    assert health_of(*drive(1.0)).problems  # not confirmed yet
 
 
 FAULTS = {
@@ -99,19 +98,14 @@ def test_each_fault_is_found_with_its_size_and_named(name, seed):
     assert said in health.problems[0] and len(health.problems) == 1
 
 
-@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('camera', [
     shows(late_s=0.2), shows(late_s=-0.2), shows(lever=0.25 + 0j), shows(lever=0.25j),
     shows(turned=math.radians(6)), shows(scale=0.9), shows(scale=1.1),
+    lambda *at: (anywhere if at[1] // EVERY % 4 == 1 else shows())(*at),  # a quarter of the images
 ])  # fmt: skip
-def test_what_moves_the_robot_by_little_is_no_fault(camera, seed):
-    health = health_of(*drive(camera=camera, seed=seed))
+def test_what_moves_the_robot_by_little_is_no_fault(camera):
+    health = health_of(*drive(camera=camera, seed=1))
     assert health.well > LIKELY and health.problems == []
-
-
-def test_a_quarter_of_wrong_images_is_no_fault():
-    mixed = drive(camera=lambda *at: (anywhere if at[1] // EVERY % 4 == 1 else shows())(*at))
-    assert health_of(*mixed).well > LIKELY
 
 
 def test_who_is_placed_anew_is_confirmed_by_driving_and_twice_as_long_each_time():
@@ -128,13 +122,9 @@ def test_who_is_placed_anew_is_confirmed_by_driving_and_twice_as_long_each_time(
 
 def still(step_m=0.0, step_ns=1, yaw=0.0):
     """Nine images right beside each other, on a path of one knot."""
-    images = (
-        PositionFix(
-            1 + i * step_ns, complex(i * step_m), yaw, 0.01, 1e-3, (i * step_m, 0.0, 0.0), 0.0
-        )
-        for i in range(9)
-    )
-    return DrivenPath(((1, 0.0, 0.0, 0.0),)), tuple(images)
+    places = [(1 + i * step_ns, i * step_m) for i in range(9)]
+    images = [PositionFix(at, x, yaw, 0.01, 1e-3, (x, 0.0, 0.0), 0.0) for at, x in places]
+    return DrivenPath(((1, 0.0, 0.0, 0.0),)), images
 
 
 ODD = {
@@ -153,11 +143,10 @@ def test_of_little_or_odd_evidence_the_answer_is_finite(name):
     with np.errstate(divide='raise', over='raise', invalid='raise'), warnings.catch_warnings():
         warnings.simplefilter('error')
         health = health_of(*ODD[name])
-    assert 0.0 <= health.well <= 1.0 and cmath.isfinite(health.size)
-    assert math.isfinite(health.confirmed_m)
+    assert 0.0 <= health.well <= 1.0 and cmath.isfinite(health.size + health.confirmed_m)
 
 
-@pytest.mark.parametrize('name', FAULTS)
+@pytest.mark.parametrize('name', ['late', 'to the left', 'turned', 'less far'])
 def test_neither_map_nor_odometry_has_a_direction_that_matters(name):
     camera, exact = FAULTS[name][0], 1e-9  # noise is drawn in the map's axes
     first = health_of(*drive(camera=camera, std_m=exact))

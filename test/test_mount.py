@@ -74,8 +74,7 @@ def test_the_place_of_the_camera_is_learned_with_the_graph(lever):
     error, std = abs(mount.lever - lever), np.sqrt(np.diag(mount.uncertainty)[:2])
     assert error < 0.04 and error < 3 * np.hypot(*std) and np.all(std < 0.1)
     assert graph.certificate.certified
-    images = graph.stack.images
-    places, truth = graph_poses(graph, len(poses))[images, :2], poses[images, :2]
+    places, truth = (p[graph.stack.images, :2] for p in (graph_poses(graph, len(poses)), poses))
     assert np.hypot(*(align(places, truth).apply(places) - truth).T).mean() < 0.06
 
 
@@ -106,7 +105,7 @@ def test_base_and_camera_are_inverse():
     np.testing.assert_allclose(mount.base(camera_poses(poses, yaw=0.4), 1), poses)
 
 
-@pytest.mark.parametrize('yaw_std', [0.05, 0.5, 1.5])
+@pytest.mark.parametrize('yaw_std', [0.05, 1.5])
 def test_the_covariance_of_the_base_is_that_of_its_samples(yaw_std):
     rng = np.random.default_rng(0)
     pose, stds = np.array([1.0, 2.0, 0.7]), np.array([0.05, 0.1, yaw_std])
@@ -116,8 +115,8 @@ def test_the_covariance_of_the_base_is_that_of_its_samples(yaw_std):
     assert abs(places.mean() - complex(*base[:2])) < 2e-3
     true = np.trace(np.cov(places.real, places.imag))
     assert np.trace(covariance[:2, :2]) == pytest.approx(true, rel=0.25)
+    samples = np.column_stack([places.real, places.imag, drawn[:, 2]])
     if yaw_std == 0.05:
-        samples = np.column_stack([places.real, places.imag, drawn[:, 2]])
         np.testing.assert_allclose(covariance, np.cov(samples.T), atol=2e-4)
 
 
@@ -130,22 +129,13 @@ def test_an_uncertain_lever_matters_where_the_robot_heads_elsewhere_than_in_trai
     assert opposite[0, 0] == pytest.approx(0.01 + (2 * 0.3) ** 2, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    'values',
-    [
-        {'camera_ahead': Quantity(np.nan, 0.1)},
-        {'camera_left': Quantity(9.0, 0.1)},
-        {'wheel_scale': Quantity(0.0, 0.01)},
-        {'camera_delay': Quantity(60.0, 0.01)},
-        {'turn_loss': Quantity(0.0, -1.0)},
-    ],
-)
-def test_what_no_robot_has_is_refused(values):
-    with pytest.raises(DataError):
-        Rig(**values)
-
-
-def test_a_record_comes_back_as_it_was():
+def test_what_no_robot_has_is_refused_and_a_record_comes_back_as_it_was():
+    for name, *wrong in (
+        ('camera_ahead', np.nan, 0.1), ('camera_left', 9.0, 0.1), ('wheel_scale', 0.0, 0.01),
+        ('camera_delay', 60.0, 0.01), ('turn_loss', 0.0, -1.0),
+    ):  # fmt: skip
+        with pytest.raises(DataError):
+            Rig(**{name: Quantity(*wrong)})
     rig = dataclasses.replace(RIG, camera_delay=Quantity(0.12, 0.03))
     assert Rig.from_mapping(rig.to_mapping()) == rig
     for wrong in ({'camera_ahead': [1.0]}, {'unknown': [0.0, 0.0]}, {'camera_ahead': 'ab'}):
@@ -153,7 +143,7 @@ def test_a_record_comes_back_as_it_was():
             Rig.from_mapping(wrong)
 
 
-def static_bag(path, links, image_frame='camera', base='base_link'):
+def static_bag(path, links, image_frame, base):
     """A bag of an image, an odometry message and static transforms: child, parent, place, turn."""
     odometry, image = message('nav_msgs/msg/Odometry'), message('sensor_msgs/msg/CompressedImage')
     odometry.child_frame_id, image.header.frame_id, image.format = base, image_frame, 'jpeg'
@@ -184,17 +174,12 @@ LINKS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ('links', 'frames', 'place'),
-    [
-        (LINKS, ('camera', 'base_link'), 0.15 + 0.1j),  # the mast looks to the left
-        (LINKS, ('/camera', 'base_footprint'), 0.15 + 0.1j),
-        (LINKS, ('camera', 'elsewhere'), None),
-        (LINKS[1:], ('camera', 'base_footprint'), None),
-        ([('camera', 'camera', (1.0, 0.0, 0.0), TO_THE_LEFT)], ('camera', 'base_link'), None),
-        ([('camera', 'base_link', (1.0, 0.0, 0.0), (0.0,) * 4)], ('camera', 'base_link'), None),
-    ],
-)
+@pytest.mark.parametrize(('links', 'frames', 'place'), [
+    (LINKS, ('/camera', 'base_footprint'), 0.15 + 0.1j),  # the mast looks to the left
+    (LINKS, ('camera', 'elsewhere'), None),
+    ([('camera', 'camera', (1.0, 0.0, 0.0), TO_THE_LEFT)], ('camera', 'base_link'), None),
+    ([('camera', 'base_link', (1.0, 0.0, 0.0), (0.0,) * 4)], ('camera', 'base_link'), None),
+])  # fmt: skip
 def test_static_transforms_say_where_the_camera_sits(tmp_path, links, frames, place):
     path = static_bag(tmp_path / 'bag', links, *frames)
     with Bag(path) as bag:

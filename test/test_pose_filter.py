@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from filter_drives import NOISY, SECOND, START_NS, FilterDrive, fed, seconds_of, snapshot, started
+from filter_drives import NOISY, SECOND, START_NS, FilterDrive, fed, snapshot, started, winding
 
 from sfa_localization.data.error_correlation import LEAST_M, ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError
@@ -26,18 +26,14 @@ either = pytest.mark.parametrize('heading', [True, False])
 
 
 @either
-@pytest.mark.parametrize('start', [(3.0, -2.0, math.pi), (0, 0, -math.pi + 1e-3)])
-def test_exact_data_gives_zero_error(heading, start):
-    outcomes = FilterDrive(seconds=20, start=start).feed(started(start), heading)
-    assert max(error for _, _, error, _ in outcomes) < 1e-6
-    assert all(update.accepted for _, update, _, _ in outcomes)
-
-
 @pytest.mark.parametrize('speed', [1.0, -0.7, 1e-30])
 @pytest.mark.parametrize('turn', [0.0, 5e-324, 1e-7, 0.8])
-def test_exact_data_straight_turning_and_reversing(speed, turn):
-    drive, fused = FilterDrive(twists=np.tile([speed, turn], (100, 1))), started()
-    assert max(error for _, _, error, _ in drive.feed(fused)) < 1e-6
+def test_exact_data_straight_turning_and_reversing(speed, turn, heading):
+    start = (3.0, -2.0, math.pi)
+    drive, fused = FilterDrive(twists=winding(4, 50, speed, turn), start=start), started(start)
+    outcomes = drive.feed(fused, heading)
+    assert max(error for _, _, error, _ in outcomes) < 1e-6
+    assert all(update.accepted for _, update, _, _ in outcomes)
     assert np.isfinite(fused.state.covariance).all()
 
 
@@ -70,9 +66,8 @@ def test_prediction_to_a_stamp_recalls_and_extrapolates_less_and_less_sure():
 # Time.
 
 
-@either
-@pytest.mark.parametrize('late_s', [0.5, 4.0])
-def test_shuffled_and_late_messages_give_what_messages_in_time_give(heading, late_s):
+@pytest.mark.parametrize(('late_s', 'heading'), [(0.5, False), (4.0, True)])
+def test_shuffled_and_late_messages_give_what_messages_in_time_give(late_s, heading):
     drive, rng = FilterDrive(seconds=15, **NOISY), np.random.default_rng(1)
     drive.seen[40:44, :2] += 3.0
     # Pictures come late, odometry up to 0.1 s: then in the order of arrival.
@@ -119,10 +114,9 @@ def test_a_bag_that_loops_starts_the_filter_anew(seconds):
     assert looped.status.level is Level.LOCALISED
 
 
-@pytest.mark.parametrize('held_s', [0.5, 2.0])
-def test_odometry_that_was_held_up_does_not_come_once_more(held_s):
+def test_odometry_that_was_held_up_does_not_come_once_more():
     drive = FilterDrive(seconds=12)
-    held = [event for event in drive.events() if 0 <= seconds_of(event) - 6 < held_s]
+    held = drive.events(6, 8)
     prompt = [event for event in drive.events() if event not in held]
     cut = next(i for i, event in enumerate(prompt) if event[0] > held[-1][0] + SECOND)
     fused = fed(started(), drive, prompt[:cut] + held + prompt[cut:])
@@ -221,32 +215,28 @@ def test_covariance_stays_symmetric_positive_over_a_long_run():
             assert np.linalg.eigvalsh(covariance)[0] > 0
 
 
-def test_bias_and_scale_are_learnt():
-    drive = FilterDrive(seconds=120, v_std=0.01, omega_std=0.005, position_std=0.1, yaw_std=0.03,
-                  share=0.7, bias=0.01, scale=1.03)  # fmt: skip
-    learning = fed(started(), drive)
-    assert learning.state.yaw_rate_bias == pytest.approx(0.01, abs=0.002)
-    assert learning.state.wheel_scale == pytest.approx(1.03, abs=0.01)
-
-
-def test_it_beats_images_and_odometry():
-    drive, blind = FilterDrive(seconds=60, **NOISY), started()
-    errors = [error for _, _, error, _ in drive.feed(started())]
+def test_it_learns_bias_and_scale_and_beats_images_and_odometry():
+    drive = FilterDrive(seconds=60, **{**NOISY, 'bias': 0.03, 'scale': 1.08})
+    fused, blind = started(), started()
+    errors = [error for _, _, error, _ in drive.feed(fused)]
     drive.feed(blind, pictures=False)
     alone = np.hypot(*(drive.seen[:, :2] - drive.poses[drive.pictures, :2]).T)
     assert np.mean(errors) < 0.7 * alone.mean() and errors[-1] < drive.error(blind, -1)[0]
+    assert fused.state.yaw_rate_bias == pytest.approx(0.03, abs=0.008)
+    assert fused.state.wheel_scale == pytest.approx(1.08, abs=0.04)
 
 
-def test_stretches_of_images_that_lie_off_pull_less():
-    """Errors of images have heavy tails; with all their weight they would make 0.060 m."""
-    errors = []
-    for seed in range(4):
-        drive = FilterDrive(seconds=60, position_std=0.15, seed=seed)
-        rng = np.random.default_rng(seed)
-        for start in rng.choice(len(drive.seen) - 10, 12, replace=False):
-            drive.seen[start : start + 10, :2] += rng.normal(0, 0.4, 2)
-        errors += [error for _, _, error, _ in drive.feed(PoseFilter(), True)]
-    assert np.mean(errors) < 0.058
+def test_images_that_lie_off_pull_less():
+    """Though they are inside the gate: errors of images have heavy tails."""
+    drive, pulls = FilterDrive(seconds=5, position_std=0.2, yaw_std=0.05), []
+    for off_m in (0.2, 0.45):
+        fused = fed(started(), drive)
+        before = fused.state.pose
+        seen = compose(before, np.array([0.0, off_m, 0.0]))
+        update = fused.add_measurement(fused.state.stamp_ns + 1, seen, drive.covariance(True))
+        assert update.accepted
+        pulls.append(math.dist(fused.state.pose[:2], before[:2]))
+    assert 0 < pulls[1] < pulls[0]
 
 
 @pytest.mark.parametrize(('share', 'length_m'), [(0.3, LEAST_M), (0.7, 1e6)])
@@ -277,10 +267,8 @@ def test_a_spike_is_rejected_and_moves_nothing(off, heading):
 
 
 @either
-def test_a_sustained_offset_is_believed_in_the_end_but_no_images_in_disagreement(
-    heading,
-):
-    drive, other = FilterDrive(seconds=40, **NOISY), FilterDrive(seconds=40, **NOISY)
+def test_a_sustained_offset_is_believed_in_the_end_but_no_images_in_disagreement(heading):
+    drive, other = FilterDrive(seconds=25, **NOISY), FilterDrive(seconds=25, **NOISY)
     drive.seen[150:, :2] += [1.5, 0.0]
     outcomes = drive.feed(started(), heading)
     assert not outcomes[152][1].accepted and abs(outcomes[-1][2] - 1.5) < 0.5
@@ -289,14 +277,14 @@ def test_a_sustained_offset_is_believed_in_the_end_but_no_images_in_disagreement
     assert max(error for _, _, error, _ in outcomes) < 1.0 and outcomes[-1][2] < 0.5
 
 
-@pytest.mark.parametrize(('outage', 'heading'), [(5.0, True), (30.0, True), (30.0, False)])
+@pytest.mark.parametrize(('outage', 'heading'), [(5.0, True), (30.0, False)])
 def test_a_cluster_of_wrong_images_after_an_outage_is_not_trusted_at_once(outage, heading):
     drive, fused = FilterDrive(seconds=60, **NOISY), started()
     drive.feed(fused, heading, stop=15)
     first = int(np.searchsorted(drive.pictures, (15 + outage) * 50))
     drive.seen[first : first + 12, :2] += [3.0, 4.0]
-    for event in drive.events():
-        if seconds_of(event) >= 15 and (event[1] == 0 or event[2] >= first):
+    for event in drive.events(15):
+        if event[1] == 0 or event[2] >= first:
             drive.give(fused, event, heading)
             if event[1] and event[2] < first + 5:
                 assert fused.status.level is not Level.LOCALISED
@@ -316,15 +304,6 @@ def test_one_picture_with_heading_starts_at_once_and_one_that_is_wrong_is_outvot
     drive.seen[0] = [9.0, 9.0, 2.0]
     outcomes = drive.feed(PoseFilter(), heading=True)
     assert outcomes[0][1].accepted and not outcomes[1][1].accepted and outcomes[3][2] < 0.8
-
-
-@pytest.mark.parametrize('seed', range(3))
-def test_without_heading_the_first_meters_start_it(seed):
-    drive = FilterDrive(seconds=8, start=(4.0, -3.0, 2.0 + seed), **NOISY, seed=seed)
-    outcomes = drive.feed(PoseFilter())
-    started = next(k for k, (_, update, _, _) in enumerate(outcomes) if update.accepted)
-    assert drive.pictures[started] / 50 < 3.0
-    assert abs(outcomes[-1][3]) < 0.3 and outcomes[-1][2] < 0.8
 
 
 @pytest.mark.parametrize('stds', [(2.5, 0.1, 0.1), (0.1, 2.5, 0.1), (0.1, 0.1, 0.9)])
@@ -377,12 +356,10 @@ def test_a_malformed_pose_and_parameters_that_do_not_fit_are_rejected():
     with pytest.raises(DataError):
         PoseFilter().set_pose(1, (0, 0, 0), -np.eye(3))
     for values, why in (
-        ({'degraded_std': 3.0}, 'degraded_std'), ({'lost_std': 200.0}, 'outside'),
-        ({'speed_std': math.nan}, 'finite'), ({'odometry_factor': 0.0}, 'outside'),
+        ({'degraded_std': 3.0}, 'degraded_std'), ({'odometry_factor': 0.0}, 'outside'),
+        ({'speed_std': math.nan}, 'finite'), ({'initial_pose': ('x', 2.0, 3.0)}, 'initial_pose'),
         ({'initial_pose': (1.0, 2.0)}, '2 numbers given; give x'),
-        ({'initial_pose': (1.0, 2.0, math.inf)}, 'finite'),
         ({'initial_pose': (1.0, 2.0, 90.0)}, 'give radians'),
-        ({'initial_pose': ('x', 2.0, 3.0)}, 'initial_pose'),
     ):  # fmt: skip
         with pytest.raises(ConfigError, match=why):
             FilterConfig(**values)
@@ -401,7 +378,6 @@ def test_what_cannot_be_used_is_counted_and_changes_nothing():
     for stamp_ns, value, covariance, reason in (
         (newest + 1, [math.nan, 0], np.eye(2), 'position is not finite'),
         (newest + 1, [1e300, 0], np.eye(2), 'position is not finite'),
-        (newest + 1, [0, 0], -np.eye(2), NOT_POSITIVE),
         (newest + 1, [0, 0], [[1, 5], [5, 1]], NOT_POSITIVE),
         (newest + 1, [0, 0], [[1, 0.5], [0, 1]], NOT_POSITIVE),
         (newest + 1, [0, 0], np.full((2, 2), math.nan), NOT_POSITIVE),
@@ -425,7 +401,7 @@ def test_what_cannot_be_used_is_counted_and_changes_nothing():
     assert fused.state is None and dict(fused.counts) == {**counted, 'reset': 1}
 
 
-@pytest.mark.parametrize('variances', [(0, 0), (-1, -1), (math.nan, math.inf), (1e300, 1e3)])
+@pytest.mark.parametrize('variances', [(0, 0), (math.nan, math.inf), (1e300, 1e3)])
 def test_unusable_variances_give_way_to_the_configured_ones(variances):
     fused, plain, drive = started(), started(), FilterDrive(seconds=2)
     for i, stamp in enumerate(drive.stamps_ns):
@@ -446,11 +422,23 @@ def test_a_heading_that_is_not_known_is_left_out_and_zero_covariance_is_unknown_
     assert not update.accepted and without.state.position_std > 0.01
 
 
+def test_odometry_alone_carries_it_through_an_outage_of_the_images_and_the_state_says_why():
+    drive, fused = FilterDrive(seconds=20, **NOISY), PoseFilter()
+    for start, stop, pictures, level, reasons in (
+        (0, 0, True, Level.UNINITIALISED, ('no odometry and no images yet',)),
+        (0, 0.05, True, Level.UNINITIALISED, ('no usable image yet',)),
+        (0.05, 10, True, Level.LOCALISED, ()),
+        (10, 14, False, Level.DEGRADED, ('no usable image for 4 s',)),
+        (14, 20, True, Level.LOCALISED, ()),
+    ):
+        drive.feed(fused, True, start, stop, pictures)
+        assert fused.status.level is level and fused.status.reasons == reasons
+
+
 def test_images_alone_carry_it_through_an_outage_of_the_odometry():
     drive, fused = FilterDrive(seconds=30, **NOISY), started()
     drive.feed(fused, heading=True, stop=10)
-    images = [event for event in drive.events() if 10 <= seconds_of(event) < 20 and event[1]]
-    fed(fused, drive, images)
+    fed(fused, drive, [event for event in drive.events(10, 20) if event[1]])
     assert fused.status.level is not Level.LOCALISED and drive.error(fused, 999)[0] < 1.0
     assert any('no odometry' in reason for reason in fused.status.reasons)
     outcomes = drive.feed(fused, heading=True, start=20)
@@ -486,31 +474,14 @@ def test_the_pose_of_the_odometry_bridges_its_gaps_and_speed_alone_is_uncertain(
     assert turned.pose == pytest.approx([0.9, 0.2, 0.8], abs=0.05)
 
 
-def test_the_state_machine_reports_why():
-    drive, fused = FilterDrive(seconds=20, **NOISY), PoseFilter()
-    assert fused.status.reasons == ('no odometry and no images yet',)
-    drive.feed(fused, stop=0.05)
-    assert fused.status.reasons == ('no usable image yet',)
-    drive.feed(fused, heading=True, start=0.05, stop=10)
-    assert fused.status.level is Level.LOCALISED and fused.status.reasons == ()
-    drive.feed(fused, start=10, stop=14, pictures=False)
-    assert fused.status.level is Level.DEGRADED
-    assert 'no usable image for 4 s' in fused.status.reasons
-    drive.feed(fused, heading=True, start=14)
-    assert fused.status.level is Level.LOCALISED
-
-
 def test_the_filter_begins_with_the_robot_that_training_learned():
     rig = Rig(wheel_scale=Quantity(1.05, 0.01), turn_loss=Quantity(0.08, 0.004))
     fused = PoseFilter()
     fused.expect(rig)
     fused.set_pose(START_NS, (0.0, 0.0, 0.0), np.diag([1e-4] * 3))
-    state = fused.state
-    assert state.turn_loss == 0.08
-    assert state.covariance[LOSS, LOSS] == pytest.approx(0.004**2)
-    assert state.covariance[SCALE, SCALE] == pytest.approx((0.01 / 1.05) ** 2)
+    stds = np.sqrt(fused.state.covariance.diagonal()[[LOSS, SCALE]])
+    assert stds == pytest.approx([0.004, 0.01 / 1.05])
     for k in range(1, 51):  # in an arc: 1 m counted, less 0.08 m per radian
         fused.add_odometry(START_NS + k * 20_000_000, 1.0, 0.5)
-    moved = np.hypot(*fused.state.pose[:2])
-    arc = 1.05 - 0.08 * 0.5
-    assert moved == pytest.approx(arc * np.sin(0.25) / 0.25, abs=0.002)
+    chord = (1.05 - 0.08 * 0.5) * np.sin(0.25) / 0.25
+    assert np.hypot(*fused.state.pose[:2]) == pytest.approx(chord, abs=0.002)

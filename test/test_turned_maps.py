@@ -82,22 +82,12 @@ def share_inside(estimate, places):
 
 
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
-@pytest.mark.parametrize('steps', [0, 1, 7, -3])
-def test_a_roll_of_the_columns_is_a_turn_of_the_robot(sign, steps):
-    maps = np.random.default_rng(0).standard_normal((3, 2, COLUMNS, 4)).astype(np.float32)
-    yaw = np.full(3, -sign * 2 * np.pi * steps / COLUMNS)
-    rolled = turned_back(spectrum(np.roll(maps, steps, axis=2)), yaw, sign)
-    np.testing.assert_allclose(rolled, turned_back(spectrum(maps), np.zeros(3), sign), atol=2e-6)
-
-
-@pytest.mark.parametrize('sign', [-1.0, 1.0])
 def test_features_do_not_depend_on_the_heading_between_columns(sign):
     poses = unseen(20)
     yaw = np.random.default_rng(1).uniform(-9, 9, 20)
     turned = np.column_stack([poses[:, :2], yaw])
-    features = [
-        turned_back(spectrum(maps_at(p, sign, noise=0.0)), p[:, 2], sign) for p in (poses, turned)
-    ]
+    exact = (spectrum(maps_at(each, sign, noise=0.0)) for each in (poses, turned))
+    features = [turned_back(next(exact), each[:, 2], sign) for each in (poses, turned)]
     np.testing.assert_allclose(*features, atol=2e-5)
     assert np.abs(features[0]).max() > 0.5
 
@@ -108,9 +98,8 @@ def test_principal_components_hold_what_the_vectors_span():
     spectra = spanned.astype(np.complex64)[:, None]
     turned = TurnedMaps.fit(spectra, np.zeros(300), 1.0)
     features = turned.features(spectra, np.zeros(300))
-    assert features.shape == (300, 4)
+    assert features.shape == (300, 4) and np.all(np.diff(features.var(0)) < 0)
     np.testing.assert_allclose(turned.axes.T @ turned.axes, np.eye(4), atol=1e-4)
-    assert np.all(np.diff(features.var(0)) < 0)
     np.testing.assert_allclose(features @ turned.axes.T + turned.mean, spanned, atol=1e-3)
     with pytest.raises(DataError, match='equal'):
         TurnedMaps.fit(np.ones((50, 8, 1), np.complex64), np.zeros(50), 1.0)

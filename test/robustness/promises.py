@@ -41,7 +41,7 @@ PROMISES = {
         ('late or shuffled messages', 'up to 5 s late they give the same estimate'),
     'test_robustness.py::test_a_replay_gives_the_same_messages_and_any_pace_the_same_estimate':
         ('a replay at another pace', 'the same estimate, bit by bit'),
-    'test_irregular_odometry.py::test_odometry_with_poses_may_be_stamped_irregularly':
+    'test_odometry_steps.py::test_odometry_with_poses_may_be_stamped_irregularly':
         ('odometry in bundles, or stamped on reception', 'its poses say how far the robot moved'),
     'test_pose_filter.py::test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed':
         ('images of another clock', 'DEGRADED, with the difference of the clocks'),
