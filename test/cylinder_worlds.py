@@ -14,12 +14,9 @@ from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate
-from sfa_localization.data.sphere import Sphere
-from sfa_localization.keyframes.errors import LeftOut
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.light import Conditions
 from sfa_localization.keyframes.location import hypotheses, located
-from sfa_localization.keyframes.training import choose_keyframes, located_without
 from sfa_localization.keyframes.upright import upright
 from sfa_localization.metric.settings import MetricConfig
 from sfa_localization.sfa.network import Architecture, Layer
@@ -104,14 +101,6 @@ def run_in(world: Spheres, odometry: Odometry, config: PanoramaConfig, name: str
     """A run whose pictures show the world from the odometry's poses."""
     images = world.panoramas(odometry.poses, config)
     return Run(name, PanoramaArray(odometry.stamps_ns, images), odometry)
-
-
-def learnt_keyframes(textures, poses, path_m, sphere: Sphere, drives) -> Keyframes:
-    """As `choose_keyframes`, with the errors of some that are left out, which all count alike."""
-    keyframes, rows = choose_keyframes(textures, poses, sphere, drives)
-    tried, fits, _ = located_without(keyframes, path_m[rows])
-    trials = LeftOut.of(fits, keyframes.poses[tried], np.full(len(tried), 1 / len(tried)))
-    return replace(keyframes, errors=trials.learn())
 
 
 def alone(keyframes: Keyframes, image: np.ndarray, conditions: Conditions | None = None):

@@ -59,14 +59,6 @@ def test_all_points_inducing_make_the_exact_process():
     assert np.allclose(expand(basis, unseen)[:, :-1] @ weights, exact, atol=1e-5)
 
 
-def test_fewer_inducing_points_leave_variance_missing_far_from_them():
-    basis = Process.fit(FEATURES, np.full(3, 0.5), 0.01, 10)
-    assert len(basis.points) == 10
-    near, far = basis.points[:1] / 0.5, np.full((1, 3), 50.0)
-    assert missing(basis, expand(basis, near))[0] == pytest.approx(0.0, abs=1e-5)
-    assert missing(basis, expand(basis, far))[0] == pytest.approx(100.0, rel=1e-6)
-
-
 NOISE_M = 0.05
 BASES = {
     'monomials': Monomials.fit(FEATURES, 3, 1e-3),

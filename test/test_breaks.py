@@ -54,11 +54,7 @@ def seconds_in(text: str) -> list[float]:
     return [float(word) for word in text.split() if word[0].isdigit()]
 
 
-def test_images_that_change_with_the_way_contradict_nothing():
-    wheels = odometry(DRIVING)
-    same, texts = contradicted(wheels, IMAGES, textures(DRIVING))
-    assert texts == [] and not same.part.any()
-    # A turn changes much more of an image than a way.
+def test_a_turn_changes_much_more_of_an_image_than_a_way():
     turning = (np.arange(len(STAMPS)) // 75) % 3 > 0
     wheels = odometry(np.where(turning, 0.02, 0.4), 1.0 * turning)
     assert contradicted(wheels, IMAGES, textures(np.where(turning, 30.0, 0.4)))[1] == []

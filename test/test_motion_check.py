@@ -113,7 +113,6 @@ WRONG = {
     'degrees': (lambda s: driven(s, twists=(1, 180 / np.pi)), '(odometry twist in degrees?)'),
     'y to the right': (lambda s: driven(s, (1, -1, 1)), 'm ahead: correct its heading and axes'),
     'sign of the twist': (lambda s: driven(s, twists=(1, -1)), 'odometry twist turns opposite to'),
-    'milliseconds': (lambda s: stamped_in(s, 10**6), 'stamps holds milliseconds: correct'),
     'microseconds': (lambda s: stamped_in(s, 10**3), 'stamps holds microseconds: correct'),
 }  # fmt: skip
 

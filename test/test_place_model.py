@@ -116,13 +116,10 @@ def test_a_model_is_the_same_after_it_was_saved(model, saved, pictures, tmp_path
         assert before.yaw == pytest.approx(after.yaw, abs=1e-5)
         assert before.explained == after.explained
     assert again.quality == json.loads(json.dumps(model.quality))
-    assert (again.panorama, again.network.ranks) == (model.panorama, model.network.ranks)
     assert again.error_correlation == model.error_correlation != ErrorCorrelation()
     assert Localizer(again).filter.correlation.share == pytest.approx(again.error_correlation.share)
-    model.save(tmp_path / 'again.npz')
-    again.save(tmp_path / 'loaded.npz')
+    again.save(tmp_path / 'again.npz')
     assert (tmp_path / 'again.npz').read_bytes() == saved.read_bytes()
-    assert (tmp_path / 'loaded.npz').read_bytes() == saved.read_bytes()
 
 
 def test_what_is_no_model_is_refused_with_the_remedy(tmp_path):

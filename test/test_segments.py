@@ -118,18 +118,6 @@ def test_where_the_gyro_pauses_the_wheels_go_on():
     assert turns == pytest.approx([np.pi / 2] * 7, abs=0.01)
 
 
-def test_drift_is_the_derivative_by_a_yaw_rate_bias():
-    twists, start = meander(40.0, seed=2)
-    clean, bias = drive(twists, start=start), 1e-3
-    biased = drive(twists, start=start, bias=bias)
-    for s in cut(biased.odometry, biased.stamps_ns, ANY):
-        local = relative(clean.poses[s.images[0]], clean.poses[s.images])
-        truth = local[:, 0] + 1j * local[:, 1]
-        assert np.abs(s.path - truth).max() > 1e-4
-        assert np.abs(s.path - bias * s.path_drift - truth).max() < 2e-5
-        assert np.allclose(s.headings - bias * s.times_s, np.unwrap(local[:, 2]), atol=1e-9)
-
-
 def test_links_err_as_they_or_the_messages_say(monkeypatch):
     """Straight ahead, with noise of the yaw rate alone."""
     monkeypatch.setattr(segments_module, 'PIECE_STD_M', 10.0)
