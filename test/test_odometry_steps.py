@@ -142,11 +142,6 @@ def test_a_delay_other_than_expected_is_estimated_from_the_first_turn(late_s):
 # Stamps.
 
 
-def bursts(times):
-    """Stamps s of odometry at 50 Hz that is stamped in pairs, 1 ms apart."""
-    return times + np.where(np.arange(len(times)) % 2, 0.0, 0.019)
-
-
 def received(times):
     """Stamps s of odometry that is stamped on reception, exponentially late; order is kept."""
     late = np.random.default_rng(0).exponential(0.01, len(times))
@@ -160,7 +155,7 @@ def stalled(times):
     return np.where((times % 1.0) > 0.6, end - 1e-4 * (1 + 50 - count % 50), times)
 
 
-@pytest.mark.parametrize('stamped', [bursts, received, stalled])
+@pytest.mark.parametrize('stamped', [received, stalled])
 def test_odometry_with_poses_may_be_stamped_irregularly(stamped):
     """The poses show how far it was, whatever the stamps; images come at 8 Hz in between."""
     drive, fused, errors = FilterDrive(seconds=20, omega_std=0.01, v_std=0.02), PoseFilter(), []
