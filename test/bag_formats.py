@@ -16,6 +16,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
+from sfa_localization.bags.decoding import odometry_of
 from sfa_localization.bags.writer import BagWriter
 
 START = 1_700_000_000_123_456_789
@@ -87,6 +88,12 @@ def write_pictures(path, pictures, later=0):
     return path
 
 
+def read_odometry(bag, topic=''):
+    """All odometry of an open bag."""
+    stream = bag.stream(bag.find('odometry', topic), odometry_of)
+    return bag.to_odometry(stream, [(at, value) for _, at, value in bag.read([stream])])
+
+
 def kinds(messages):
     """Type of each topic."""
     return {message.topic: message.kind for message in messages}
@@ -109,16 +116,14 @@ def write_database(path, messages, *, schema=2, kind=str, serialization='cdr', q
     path.parent.mkdir(parents=True, exist_ok=True)
     database = sqlite3.connect(path)
     database.execute('PRAGMA synchronous=OFF')
-    extra = ', offered_qos_profiles TEXT NOT NULL' if schema >= 2 else ''
-    database.execute(
+    database.executescript(
         'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, '
-        f'serialization_format TEXT NOT NULL{extra})'
-    )
-    database.execute(
+        'serialization_format TEXT NOT NULL'
+        f'{", offered_qos_profiles TEXT NOT NULL" if schema >= 2 else ""});'
         'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, '
-        'timestamp INTEGER NOT NULL, data BLOB NOT NULL)'
+        'timestamp INTEGER NOT NULL, data BLOB NOT NULL);'
+        'CREATE INDEX timestamp_idx ON messages (timestamp ASC)'
     )
-    database.execute('CREATE INDEX timestamp_idx ON messages (timestamp ASC)')
     if schema >= 3:
         database.execute('CREATE TABLE schema(schema_version INTEGER, ros_distro TEXT)')
         database.execute('INSERT INTO schema VALUES (3, "humble")')
@@ -137,30 +142,21 @@ def write_database(path, messages, *, schema=2, kind=str, serialization='cdr', q
 def metadata(version, files, messages, *, storage='sqlite3', kind=str, compression=''):
     """Text of metadata.yaml as its version has it, of all that is read."""
     qos = yaml.safe_load(QOS_TEXT) if version >= 9 else QOS_TEXT
+    offered = {'offered_qos_profiles': qos} if version >= 4 else {}
     told = [
-        {
-            'topic_metadata': {
-                'name': topic,
-                'type': kind(kinds(messages)[topic]),
-                'serialization_format': 'cdr',
-                **({'offered_qos_profiles': qos} if version >= 4 else {}),
-            },
-            'message_count': count,
-        }
+        {'topic_metadata': {'name': topic, 'type': kind(kinds(messages)[topic]),
+                            'serialization_format': 'cdr', **offered}, 'message_count': count}
         for topic, count in Counter(message.topic for message in messages).items()
-    ]
-    receptions = [message.receive_ns for message in messages]
+    ]  # fmt: skip
+    first, *_, last = sorted(message.receive_ns for message in messages)
     information = {
-        'version': version,
-        'storage_identifier': storage,
+        'version': version, 'storage_identifier': storage,
         'relative_file_paths': [f'bag/{file}' if version < 4 else file for file in files],
-        'duration': {'nanoseconds': max(receptions) - min(receptions)},
-        'starting_time': {'nanoseconds_since_epoch': min(receptions)},
-        'message_count': len(messages),
-        'topics_with_message_count': told,
-        'compression_format': 'zstd' if compression else '',
-        'compression_mode': compression,
-    }
+        'duration': {'nanoseconds': last - first},
+        'starting_time': {'nanoseconds_since_epoch': first},
+        'message_count': len(messages), 'topics_with_message_count': told,
+        'compression_format': 'zstd' if compression else '', 'compression_mode': compression,
+    }  # fmt: skip
     return yaml.safe_dump({'rosbag2_bagfile_information': information}, sort_keys=False)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.keyframes.errors import LeftOut
@@ -49,16 +50,16 @@ class Spheres:
     def about(cls, seed: int, count: int = 40) -> Spheres:
         rng = np.random.default_rng(seed)
         bearing, reach = rng.uniform(-np.pi, np.pi, count), rng.uniform(3.0, 10.0, count)
-        places = np.stack([reach * np.cos(bearing), reach * np.sin(bearing)], 1)
+        places = reach[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
         heights, radii = rng.uniform(-2.0, 3.0, count), rng.uniform(0.4, 1.6, count)
         return cls(places, heights, radii, rng.uniform(-90, 90, (count, 3)))
 
     def symmetric(self) -> Spheres:
         """The same world four times over, a quarter turn apart."""
-        quarters = ((1, 0), (0, 1), (-1, 0), (0, -1))
-        turned = [self.places @ np.array([[c, s], [-s, c]]) for c, s in quarters]
+        x, y = self.places.T
+        places = [np.column_stack(turned) for turned in ((x, y), (-y, x), (-x, -y), (y, -x))]
         again = (np.concatenate([part] * 4) for part in (self.heights, self.radii, self.colors))
-        return Spheres(np.concatenate(turned), *again)
+        return Spheres(np.concatenate(places), *again)
 
     def panoramas(self, poses: np.ndarray, config: PanoramaConfig) -> np.ndarray:
         """Panoramas (T, H, W, 3) uint8 from poses (T, 3)."""
@@ -66,21 +67,14 @@ class Spheres:
 
     def _panorama(self, pose: np.ndarray, config: PanoramaConfig) -> np.ndarray:
         h, w = config.height, config.width
-        sense = -1 if config.clockwise else 1
-        azimuth = sense * (np.arange(w) + 0.5 - w / 2) * 2 * np.pi / w
-        elevation = np.linspace(0.6, -0.6, h)
-        offset = self.places - pose[:2]
-        reach = np.hypot(*offset.T)
-        bearing = np.arctan2(offset[:, 1], offset[:, 0]) - pose[2]
-        sideways = np.angle(np.exp(1j * (azimuth - bearing[:, None])))
-        upward = elevation - np.arctan2(self.heights, reach)[:, None]
+        azimuth = (np.arange(w) + 0.5 - w / 2) * 2 * np.pi / w * (-1 if config.clockwise else 1)
+        x, y = (self.places - pose[:2]).T
+        reach, bearing = np.hypot(x, y), np.arctan2(y, x) - pose[2]
+        sideways = wrap_angle(azimuth - bearing[:, None])
+        upward = np.linspace(0.6, -0.6, h) - np.arctan2(self.heights, reach)[:, None]
         size = (np.arctan2(self.radii, reach) ** 2 * 2)[:, None]
-        blobs = np.einsum(
-            'nh,nw,nc->hwc',
-            np.exp(-(upward**2) / size),
-            np.exp(-(sideways**2) / size),
-            self.colors,
-        )
+        rows, columns = np.exp(-(upward**2) / size), np.exp(-(sideways**2) / size)
+        blobs = np.einsum('nh,nw,nc->hwc', rows, columns, self.colors)
         return np.clip(128 + blobs, 0, 255).round().astype(np.uint8)
 
 
@@ -129,18 +123,12 @@ def alone(keyframes: Keyframes, image: np.ndarray, conditions: Conditions | None
 
 
 PLACE_SIZE = (12, 72)
-COLUMN_STEP = 4
-"""Columns of a picture of PLACE_SIZE that are one rotation step."""
-PLACE_ARCHITECTURE = Architecture(
-    PLACE_SIZE,
-    PLACE_SIZE,
-    'none',
-    (
-        Layer(field=(4, 8), stride=(4, COLUMN_STEP), linear=10, outputs=8),
-        Layer(field=(2, 4), stride=(1, 1), linear=10, outputs=8),
-        Layer(field=(2, 6), stride=(1, 1), linear=12, outputs=8),
-    ),
+LARGE_LAYERS = (
+    Layer(field=(4, 8), stride=(4, 4), linear=10, outputs=8),
+    Layer(field=(2, 4), stride=(1, 1), linear=10, outputs=8),
+    Layer(field=(2, 6), stride=(1, 1), linear=12, outputs=8),
 )
+PLACE_ARCHITECTURE = Architecture(PLACE_SIZE, PLACE_SIZE, 'none', LARGE_LAYERS)
 
 
 def recipe(clockwise: bool = True) -> Recipe:
@@ -165,14 +153,10 @@ def place(clockwise: bool = True) -> Trained:
 @cache
 def visit(clockwise: bool = True) -> Run:
     """Another drive in the place, with truth for odometry."""
-    config = recipe(clockwise).panorama
-    odometry = wander(400, 2, hz=4.0)
-    part = slice(20, 400, 9)
-    poses = odometry.poses[part] + np.array([0.05, -0.05, 0.4])
-    moved = Odometry(
-        odometry.stamps_ns[part], poses, odometry.twists[part], odometry.variances[part]
-    )
-    return run_in(Spheres.about(1), moved, config, 'visit')
+    true = wander(400, 2, hz=4.0)
+    rows = [getattr(true, name)[20::9] for name in ('stamps_ns', 'poses', 'twists', 'variances')]
+    rows[1] = rows[1] + np.array([0.05, -0.05, 0.4])
+    return run_in(Spheres.about(1), Odometry(*rows), recipe(clockwise).panorama, 'visit')
 
 
 def drive(count: int = 12, seed: int = 0, size: tuple[int, int] = SIZE) -> ImageSequence:
@@ -182,13 +166,11 @@ def drive(count: int = 12, seed: int = 0, size: tuple[int, int] = SIZE) -> Image
 
 
 PICTURES = 160
-SMALL_ARCHITECTURE = replace(
-    PLACE_ARCHITECTURE,
-    layers=tuple(
-        replace(layer, linear=linear, outputs=6)
-        for layer, linear in zip(PLACE_ARCHITECTURE.layers, (6, 6, 8), strict=True)
-    ),
+SMALL_LAYERS = (
+    replace(layer, linear=linear, outputs=6)
+    for layer, linear in zip(LARGE_LAYERS, (6, 6, 8), strict=True)
 )
+SMALL_ARCHITECTURE = replace(PLACE_ARCHITECTURE, layers=tuple(SMALL_LAYERS))
 SMALL_RECIPE = replace(
     recipe(), architecture=SMALL_ARCHITECTURE, metric=replace(recipe().metric, slow_features=4)
 )

@@ -53,26 +53,3 @@ def ordinary(count, size=(240, 320)):
         yield cv2.remap(
             picture, across.astype(np.float32), along.astype(np.float32), cv2.INTER_LINEAR
         )
-
-
-def fisheye(size, soft, count=1):
-    """Pictures (H, W, 3) of a fisheye that looks up from the street.
-
-    Its light falls off over the share `soft` of the radius.
-    """
-    height, width = size
-    center, radius = (width / 2 + 4, height / 2 - 6), min(size) / 2 * 0.97
-    rows, columns = np.mgrid[:height, :width]
-    x, y = columns - center[0], rows - center[1]
-    off = np.hypot(x, y) / radius
-    light = 1 / (1 + np.exp(np.clip((off - 1) / soft * 4, -50, 50)))
-    pictures = []
-    for picture in street(count):
-        high, wide = picture.shape[:2]
-        maps = (
-            (np.arctan2(x, y) / (2 * np.pi) + 0.5) * (wide - 1),
-            np.minimum(off * 100 / 180, 1) * (high - 1),
-        )
-        seen = cv2.remap(picture, *(part.astype(np.float32) for part in maps), cv2.INTER_LINEAR)
-        pictures.append((seen * light[..., None] + 3).astype(np.uint8))
-    return pictures

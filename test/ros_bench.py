@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bench for nodes under test: its own context and domain, an executor in a thread, deadlines.
 
-And the nodes as processes in the same domain.
+And the nodes as processes in the same domain, and the messages of a drive.
 """
 
 import contextlib
 import gc
+import json
 import os
 import subprocess
 import sys
@@ -14,15 +15,21 @@ import threading
 import time
 from unittest import mock
 
+import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
 from ros_domains import free_domain
+from std_msgs.msg import String
 
+from sfa_localization.data.messages import read_planar, read_stamp
 from sfa_localization.nodes import lifecycle
+from sfa_localization.nodes.conversions import to_odometry, to_pose_with_covariance
 
 DOMAIN = free_domain()
+SEEN, FRAMES = 'sfa/pose_with_covariance', ('odom', 'base_link')
 DEADLINE_S = 60.0  # passed only where something is wrong: busy machines take their time
 
 
@@ -55,27 +62,52 @@ def start_process(*words, **options):
     return subprocess.Popen([sys.executable, *map(str, words)], env=environment, **options)
 
 
-def start_node(name, *parameters, namespace='/', **options):
-    """The process of a node."""
-    words = [word for value in parameters for word in ('-p', value)]
-    command = '-m', 'sfa_localization', name, '--ros-args', '-r', f'__ns:={namespace}'
-    return start_process(*command, *words, **options)
-
-
-def end_process(process):
-    """Ask it to end, and make it where it does not."""
-    process.terminate()
-    try:
-        process.wait(DEADLINE_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-
-
 def end_node(node):
     """End a node as `run_node` does."""
     node.teardown()
     node.destroy_node()
+
+
+def standing(stamp_ns):
+    """Odometry of a robot that stands."""
+    return to_odometry(np.zeros(3), np.eye(3), np.zeros(2), np.eye(2) * 1e-4, stamp_ns, FRAMES)
+
+
+class AsText(String):
+    """Stands in for tf2_msgs, which the wheels of ROS lack: [stamp, pose] of transforms as text."""
+
+    def __new__(cls, transforms):
+        sent = [
+            (read_stamp(t.header.stamp), read_planar(t.transform.translation, t.transform.rotation))
+            for t in transforms
+        ]
+        return serialize_message(String(data=json.dumps(sent)))
+
+
+def message_of(drive, kind, index):
+    """Topic and message of an event of a FilterDrive, as ekf_node receives it."""
+    if kind:
+        stamp_ns = int(drive.stamps_ns[drive.pictures[index]])
+        seen = drive.seen[index], drive.covariance(heading=True)
+        return SEEN, to_pose_with_covariance(*seen, stamp_ns, 'map')
+    twist = drive.read[index], np.diag(drive.variances())
+    pose, stamp_ns = (drive.reckoned[index], np.eye(3)), int(drive.stamps_ns[index])
+    return 'odom', to_odometry(*pose, *twist, stamp_ns, FRAMES)
+
+
+def play(bench, node, drive, events=None, together=1):
+    """Send events of a FilterDrive to ekf_node, waiting after every `together` until they are
+    received: one at a time, the order between the topics is then the drive's.
+    """
+    events = drive.events() if events is None else events
+    inputs = node.monitors['odom'], node.monitors[SEEN]
+    due = [monitor.received for monitor in inputs]
+    for number, (_, kind, index) in enumerate(events, 1):
+        bench.publish(*message_of(drive, kind, index))
+        due[kind] += 1
+        if number % together == 0 or number == len(events):
+            assert until(lambda: [monitor.received for monitor in inputs] == due), due
+    return events
 
 
 class Spinner(SingleThreadedExecutor):
@@ -127,7 +159,11 @@ class Bench:
         """End a node between two callbacks, as its own process would."""
         self.executor.remove_node(node)
         self.nodes.remove(node)
-        assert until(self.executor.create_task(end_node, node).done)
+        self.do(end_node, node)
+
+    def do(self, call, *arguments):
+        """Call between two callbacks: the executor must not wait for what this destroys."""
+        assert until(self.executor.create_task(call, *arguments).done)
 
     def listen(self, kind, topic, qos=None):
         heard = self.heard.setdefault(topic, [])
@@ -146,7 +182,7 @@ class Bench:
 
     def forget(self, topic):
         """Publish on it no more; a node that is configured again is waited for again."""
-        self.node.destroy_publisher(self._publishers.pop(topic))
+        self.do(self.node.destroy_publisher, self._publishers.pop(topic))
 
     def publish_until(self, topic, message, condition):
         """Again and again: what is best effort may be lost."""

@@ -9,7 +9,7 @@ import tracemalloc
 import bag_formats as formats
 import numpy as np
 import pytest
-from bag_formats import COUNTS, DELAY, FORMATS, IMAGES, PER_IMAGE, PERIOD, image, pose, stamp
+from bag_formats import COUNTS, DELAY, FORMATS, IMAGES, PERIOD, image, pose, read_odometry, stamp
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from sfa_localization.bags.drives import ReadingRecipe, read_drive
@@ -17,6 +17,8 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.data.errors import BagError
+
+ZSTD = b'\x28\xb5\x2f\xfd'
 
 
 def snapshot(path):
@@ -36,27 +38,21 @@ def test_every_format_is_read_exactly(name, tmp_path, messages):
     before = snapshot(tmp_path)
     with Bag(path, strict=True) as bag:
         assert {topic.name: topic.count for topic in bag.topics.values()} == COUNTS
-        pictures = list(bag.images())
-        odometry, truth, gyro = bag.odometry(), bag.trajectory(), bag.yaw_rate()
-        assert {t: c.used for t, c in bag.counts.items()} == COUNTS
-        assert all(not count.skipped for count in bag.counts.values())
-        assert bag.problems == []
-    assert [at for at, _ in pictures] == [stamp(i) for i in range(IMAGES)]
-    assert all(np.array_equal(picture, image(i)) for i, (_, picture) in enumerate(pictures))
-    steps = np.arange(IMAGES * PER_IMAGE + 1) / PER_IMAGE
-    assert odometry.stamps_ns.tolist() == [stamp(i) for i in steps]
-    np.testing.assert_allclose(odometry.poses, [pose(i) for i in steps], atol=1e-12)
-    np.testing.assert_array_equal(odometry.twists, [[5.0, 0.2]] * len(steps))
-    np.testing.assert_array_equal(odometry.variances, [[0.04, 0.01]] * len(steps))
-    np.testing.assert_allclose(truth.poses, [pose(i) for i in range(IMAGES)], atol=1e-12)
-    np.testing.assert_allclose(gyro.omega, 0.01 * steps[:-1], atol=1e-15)
-    assert set(gyro.variance) == {0.09}
-    run = read_drive(path, tmp_path / 'cache', strict=True)
+        assert list(bag.images())[-1][0] == stamp(IMAGES - 1) and bag.problems == []
+    run = read_drive(path, tmp_path / 'cache', strict=True, want_truth=True)
+    assert sorted(c.used for c in run.counts.values()) == sorted(COUNTS.values())
+    assert not any(count.skipped for count in run.counts.values())
     assert run.panoramas.stamps_ns.tolist() == [stamp(i) for i in range(IMAGES)]
     (batch,) = run.panoramas.batches(IMAGES)
     assert np.array_equal(batch, [image(i) for i in range(IMAGES)])
-    assert run.ground_truth is None and 'ground_truth' not in run.counts
-    assert run.yaw_rate is not None
+    steps = np.arange(IMAGES * formats.PER_IMAGE + 1) / formats.PER_IMAGE
+    assert run.odometry.stamps_ns.tolist() == [stamp(i) for i in steps]
+    np.testing.assert_allclose(run.odometry.poses, [pose(i) for i in steps], atol=1e-12)
+    np.testing.assert_array_equal(run.odometry.twists, [[5.0, 0.2]] * len(steps))
+    np.testing.assert_array_equal(run.odometry.variances, [[0.04, 0.01]] * len(steps))
+    np.testing.assert_allclose(run.ground_truth.poses, [pose(i) for i in range(IMAGES)], atol=1e-12)
+    np.testing.assert_allclose(run.yaw_rate.omega, 0.01 * steps[:-1], atol=1e-15)
+    assert set(run.yaw_rate.variance) == {0.09}
     shutil.rmtree(tmp_path / 'cache')
     assert snapshot(tmp_path) == before
 
@@ -74,15 +70,13 @@ def test_messages_come_in_order_of_reception_from_any_moment_on(name, tmp_path, 
 
 
 WRITERS = {
-    'mcap': lambda p, m: formats.write_mcap(p / 'a.mcap', m),
-    'mcap zstd': lambda p, m: formats.write_mcap(p / 'a.mcap', m, compression='zstd'),
-    'mcap lz4': lambda p, m: formats.write_mcap(p / 'a.mcap', m, compression='lz4'),
-    'mcap, no chunks': lambda p, m: formats.write_mcap(p / 'a.mcap', m, compression=None),
+    **{f'mcap {c}': lambda p, m, c=c: formats.write_mcap(p / 'a.mcap', m, compression=c)
+       for c in ('', 'zstd', 'lz4', None)},
     'sqlite3': lambda p, m: formats.write_database(p / 'a.db3', m),
-}
+}  # fmt: skip
 
 
-@pytest.mark.parametrize('name', ['mcap, no chunks', 'sqlite3'])
+@pytest.mark.parametrize('name', ['mcap None', 'sqlite3'])
 def test_memory_does_not_grow_with_a_bag(name, tmp_path, messages):
     picture = next(m for m in messages if m.topic == '/image_raw')
 
@@ -96,43 +90,21 @@ def test_memory_does_not_grow_with_a_bag(name, tmp_path, messages):
         tracemalloc.stop()
         return most
 
-    assert peak(10_000) < 1.1 * peak(2_000) + 33_000
-
-
-@pytest.mark.parametrize('name', ['version 9', 'lone db3', 'lone mcap'])
-def test_quality_of_service_is_kept(name, tmp_path, messages):
-    with Bag(FORMATS[name](tmp_path / 'bag', messages)) as bag:
-        (qos,) = bag.topics['/odom'].qos
-    parts = qos.depth, qos.reliability.name, qos.durability.name
-    assert parts == (7, 'BEST_EFFORT', 'TRANSIENT_LOCAL')
+    assert peak(4_000) < 1.1 * peak(1_000) + 33_000
 
 
 def test_silence_of_a_library_is_an_error(tmp_path, messages, monkeypatch):
     """As rosbags 0.11 reads nothing where metadata and file spell a type differently."""
     path = FORMATS['other text in the metadata'](tmp_path / 'bag', messages)
-    with Bag(path, strict=True) as bag:
-        assert len(bag.odometry().stamps_ns) == COUNTS['/odom']
     monkeypatch.setattr(Sqlite3Reader, 'messages', lambda *_: iter(()))
     with pytest.raises(BagError, match=r'12 lost .*`mcap recover`.*`ros2 bag reindex`'):
         read_drive(path, tmp_path / 'cache')
 
 
-def test_fewer_messages_than_declared_are_counted_as_lost(tmp_path, messages):
-    path, total = tmp_path / 'bag', COUNTS['/odom']
-    formats.write_database(path / 'bag_0.db3', messages[:70])
-    (path / 'metadata.yaml').write_text(formats.metadata(5, ['bag_0.db3'], messages))
-    with Bag(path) as bag:
-        read = len(bag.odometry().stamps_ns)
-        assert bag.counts['/odom'].skipped == {'lost in a damaged bag': total - read}
-        assert f'/odom: {read} of {total} messages read' in bag.problems[0]
-    with pytest.raises(BagError, match=f'of {total} .*; read without'), Bag(path, strict=True) as b:
-        b.odometry()
-
-
 def salvaged(path):
     """Return the share of odometry that a damaged bag yields; each message is as recorded."""
     with Bag(path) as bag:
-        odometry = bag.odometry()
+        odometry = read_odometry(bag)
         for at, pose_read in zip(odometry.stamps_ns, odometry.poses, strict=True):
             np.testing.assert_allclose(pose_read, pose((at - stamp(0)) / PERIOD), atol=1e-6)
         assert bag.problems
@@ -163,23 +135,23 @@ def test_a_cut_off_bag_counts_what_is_lost(name, tmp_path, messages):
     assert 0 < salvaged(path) < 1
 
 
-def test_a_damaged_part_costs_itself_alone(tmp_path, messages):
-    path = formats.write_mcap(tmp_path / 'bag.mcap', messages, compression='zstd')
+def test_a_damaged_chunk_costs_itself_alone(tmp_path, messages):
+    path = WRITERS['mcap zstd'](tmp_path, messages)
     data = bytearray(path.read_bytes())
-    start = data.index(b'\x28\xb5\x2f\xfd', len(data) // 2)
+    start = data.index(ZSTD, len(data) // 2)
     data[start : start + 40] = b'\xff' * 40
     path.write_bytes(data)
     with Bag(path) as bag:
-        assert 0.8 < len(bag.odometry().stamps_ns) / COUNTS['/odom'] < 1
+        assert 0.8 < len(read_odometry(bag).stamps_ns) / COUNTS['/odom'] < 1
         assert any('a damaged chunk is skipped' in problem for problem in bag.problems)
 
 
-@pytest.mark.parametrize('data', [b'\x28\xb5\x2f\xfd' + bytes(20), b''])
-def test_a_damaged_message_costs_itself(data, tmp_path, messages):
+@pytest.mark.parametrize('data', [ZSTD + bytes(20), b''])
+def test_a_damaged_message_costs_itself_alone(data, tmp_path, messages):
     first = next(i for i, m in enumerate(messages) if m.topic == '/odom')
     messages = [*messages[:first], messages[first]._replace(data=data), *messages[first + 1 :]]
     with Bag(formats.write_mcap(tmp_path / 'a.mcap', messages)) as bag:
-        assert len(bag.odometry().stamps_ns) == COUNTS['/odom'] - 1
+        assert len(read_odometry(bag).stamps_ns) == COUNTS['/odom'] - 1
         assert sum(bag.counts['/odom'].skipped.values()) == 1
 
 
@@ -189,24 +161,19 @@ def test_a_missing_file_of_several_is_counted(tmp_path, messages):
     with Bag(path) as bag:
         (problem,) = bag.problems
         assert problem.endswith('bag_3.mcap: is missing; copy all files of the bag')
-        bag.odometry()
+        read_odometry(bag)
         assert sum(bag.counts['/odom'].skipped.values()) > 0
     with pytest.raises(BagError, match=r'bag_3.mcap: is missing'), Bag(path, strict=True):
         pass
 
 
-@pytest.mark.parametrize(
-    ('content', 'complaint'),
-    [
-        (b'', 'holds nothing'),
-        (b'not a bag at all', 'is no bag file'),
-        (b'SQLite format 3\x00', 'no readable bag database'),
-        (b'\x89MCAP0\r\n', 'holds no readable message'),
-        (b'#ROSBAG V2.0\n', 'no readable bag .*`rosbag reindex`'),
-        (b'\x28\xb5\x2f\xfd', 'cut-off zstd data'),
-        (None, 'neither metadata.yaml nor'),
-    ],
-)
+@pytest.mark.parametrize(('content', 'complaint'), [
+    (b'', 'holds nothing'), (b'not a bag at all', 'is no bag file'),
+    (b'SQLite format 3\x00', 'no readable bag database'),
+    (b'\x89MCAP0\r\n', 'holds no readable message'), (ZSTD, 'cut-off zstd data'),
+    (b'#ROSBAG V2.0\n', 'no readable bag .*`rosbag reindex`'),
+    (None, 'neither metadata.yaml nor'),
+])  # fmt: skip
 def test_what_holds_no_bag_is_one_error(content, complaint, tmp_path):
     path = tmp_path / 'bag.mcap'
     path.mkdir() if content is None else path.write_bytes(content)
@@ -235,9 +202,9 @@ def test_messages_in_a_write_ahead_log_are_a_problem(tmp_path, messages):
 
 def test_odd_names_are_opened_and_a_pipe_is_no_bag(tmp_path, messages):
     for name in ('a?b', 'a#b', 'a%20b', 'ä b', '\udcff'):
-        FORMATS['sqlite3'](tmp_path / 'plain', messages).rename(tmp_path / name)
+        FORMATS['sqlite3'](tmp_path / 'plain', messages[:50]).rename(tmp_path / name)
         with Bag(tmp_path / name, strict=True) as bag:
-            assert len(bag.odometry().stamps_ns) == COUNTS['/odom']
+            assert len(list(bag.messages(bag.topics))) == 50
     os.mkfifo(tmp_path / 'pipe.mcap')
     with pytest.raises(BagError, match='neither a file'), Bag(tmp_path / 'pipe.mcap'):
         pass
@@ -256,10 +223,16 @@ def test_images_without_odometry_are_skipped_and_counted(tmp_path, messages):
 
 @pytest.mark.parametrize(('distinct', 'used'), [(False, [0, 1, 2, 3, 4, 5]), (True, [0, 3, 5])])
 def test_learning_leaves_out_images_that_repeat_the_one_before(distinct, used, tmp_path):
-    """A driver that was late sends an old image with a new stamp: it shows another place."""
-    formats.write_pictures(tmp_path / 'bag', [image(k) for k in (0, 0, 0, 3, 3, 0)])
-    run = read_drive(tmp_path / 'bag', tmp_path / 'cache', ReadingRecipe(distinct=distinct))
+    """A driver that was late sends an old image with a new stamp: it shows another place. What is
+    no panorama is unwrapped.
+    """
+    pictures = [np.full((20, 40, 3), k, np.uint8) for k in (0, 0, 0, 3, 3, 0)]
+    formats.write_pictures(tmp_path / 'bag', pictures)
+    camera = CameraConfig(camera_model='equirectangular')
+    recipe = ReadingRecipe(camera=camera, distinct=distinct)
+    run = read_drive(tmp_path / 'bag', tmp_path / 'cache', recipe)
     assert run.panoramas.stamps_ns.tolist() == [stamp(i) for i in used]
+    assert run.panoramas.shape == (60, 600, 3)
     skipped = {'image repeats the one before': 3} if distinct else {}
     assert run.counts['images'].as_dict() == {'used': len(used), 'skipped': skipped}
 
@@ -267,21 +240,12 @@ def test_learning_leaves_out_images_that_repeat_the_one_before(distinct, used, t
 def test_truth_is_read_only_when_wanted(tmp_path, messages):
     broken = [m._replace(data=b'\xff') if m.topic == '/ground_truth' else m for m in messages]
     path = formats.write_version(tmp_path / 'bag', broken, 5)
-    read_drive(path, tmp_path, strict=True)
+    assert read_drive(path, tmp_path, strict=True).ground_truth is None
     with pytest.raises(BagError, match='/ground_truth: no usable message'):
         read_drive(path, tmp_path, want_truth=True)
-    run = read_drive(
-        path, tmp_path, ReadingRecipe(topics=TopicNames(ground_truth='/odom')), want_truth=True
-    )
-    assert run.ground_truth is not None  # one topic serves twice
+    recipe = ReadingRecipe(topics=TopicNames(ground_truth='/odom'))
+    run = read_drive(path, tmp_path, recipe, want_truth=True)
     np.testing.assert_array_equal(run.ground_truth.poses, run.odometry.poses)
-
-
-def test_images_are_unwrapped_when_they_are_no_panoramas(tmp_path):
-    formats.write_pictures(tmp_path / 'bag', [np.full((20, 40, 3), k, np.uint8) for k in range(3)])
-    camera = CameraConfig(camera_model='equirectangular')
-    run = read_drive(tmp_path / 'bag', tmp_path, ReadingRecipe(camera=camera))
-    assert run.panoramas.shape == (60, 600, 3) and len(run.panoramas) == 3
 
 
 def test_an_error_leaves_no_files(tmp_path):

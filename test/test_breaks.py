@@ -50,6 +50,10 @@ def lengths(broken: Odometry) -> list[int]:
     return counts[counts > 25].tolist()
 
 
+def seconds_in(text: str) -> list[float]:
+    return [float(word) for word in text.split() if word[0].isdigit()]
+
+
 def test_images_that_change_with_the_way_contradict_nothing():
     wheels = odometry(DRIVING)
     same, texts = contradicted(wheels, IMAGES, textures(DRIVING))
@@ -65,7 +69,7 @@ def test_wheels_that_turn_while_images_stand_are_cut_off(omega):
     stuck = between(12.0, 16.0)
     spinning = odometry(DRIVING, omega * stuck)
     broken, (text,) = contradicted(spinning, IMAGES, textures(np.where(stuck, 0.0, 0.4)))
-    begin, end = (float(word) for word in text.split() if word[0].isdigit())
+    begin, end = seconds_in(text)
     assert text.startswith('the wheels turn from') and text.endswith('images stand: cut there')
     assert (begin, end) == pytest.approx((12.0, 16.0), abs=0.7)
     before, after = lengths(broken)
@@ -79,7 +83,7 @@ def test_a_robot_that_is_carried_while_its_wheels_stand_is_cut_off():
     same, carried = textures(true), between(14.0, 30.0)[::5]
     other = np.where(carried[:, None, None], np.flip(same, 1), same)
     broken, (text,) = contradicted(odometry(true), IMAGES, other)
-    begin, end = (float(word) for word in text.split() if word[0].isdigit())
+    begin, end = seconds_in(text)
     assert 'while the wheels stand, move: cut there' in text
     assert begin < 14.0 < end and end - begin < 5.5
     assert len(lengths(broken)) == 2
@@ -95,6 +99,13 @@ def test_a_pose_that_jumps_goes_on_only_where_its_twist_says_so():
     assert 'jumps once, by up to 0.67 m: joined by its motion around' in text
     assert not joined.part.any()
     np.testing.assert_allclose(joined.poses, wheels.poses, atol=0.01)
+    often = wheels.poses
+    for at_s in range(3, 30, 3):
+        moved = compose(np.array([0.3, 0.2, 0.1]), often)
+        often = np.where(between(at_s, 31.0)[:, None], moved, often)
+    joined, text = parted(replace(wheels, poses=often))
+    assert 'jumps 9 times' in text and 'record the frame odom instead of map' in text
+    np.testing.assert_allclose(joined.poses, wheels.poses, atol=0.02)
     # Ticks that jump, of which the twist is made; and a driver that publishes no twist.
     at = int(np.flatnonzero(between(10.0, 30.0))[0])
     ticks = jumping.twists + np.outer(np.arange(len(STAMPS)) == at, [0.6 / 0.04, 0.0])
@@ -114,24 +125,24 @@ def test_a_restart_during_a_pause_breaks_odometry_there():
 
 def test_nothing_is_compared_across_a_break():
     """The map moves with the odometry in both parts, which lie in different frames."""
-    wheels = odometry(DRIVING, 0.1)
-    true = wheels.trajectory.at(IMAGES)
-    second = between(15.0, 30.0)
-    moved = compose(np.array([3.0, 9.0, 2.0]), wheels.poses)
+    wheels, second = odometry(DRIVING, 0.1), between(15.0, 30.0)
+    true, moved = wheels.trajectory.at(IMAGES), compose(np.array([3.0, 9.0, 2.0]), wheels.poses)
     reset = replace(wheels, poses=np.where(second[:, None], moved, wheels.poses))
-    pair = compare_map(reset, IMAGES, true)
-    assert pair.differs('alike') or pair.scale < 0.95
     broken = replace(reset, part=second.astype(np.int64))
-    pair = compare_map(broken, IMAGES, true)
+    without, pair = (compare_map(each, IMAGES, true) for each in (reset, broken))
+    assert without.differs('alike') or without.scale < 0.95
     assert not pair.differs('alike') and pair.scale == pytest.approx(1.0, abs=0.01)
     # Places on both sides may be the same: see find_closures.
     path = np.diff(driven(broken, IMAGES))
     assert path[75] == pytest.approx(STRETCH_M, abs=0.2) and path.sum() < STRETCH_M + 12
 
 
-@pytest.mark.parametrize(('degrees', 'speed'), [(12.0, 0.4), (5.0, 0.4), (-8.0, 0.4), (5.0, -0.4)])
+@pytest.mark.parametrize(('degrees', 'speed'), [(12.0, 0.4), (-5.0, -0.4)])
 def test_a_heading_beside_the_way_is_turned_to_it(degrees, speed):
-    wheels = odometry(np.full(len(STAMPS), speed), 0.1)
+    rng = np.random.default_rng(0)
+    wheels = odometry(speed + 0.1 * rng.standard_normal(len(STAMPS)), 0.1)
+    check = check_motion(wheels)
+    assert check.corrected == [] and (check.odometry.poses == wheels.poses).all()
     off = wheels.poses + np.array([0.0, 0.0, np.radians(degrees)])
     check = check_motion(replace(wheels, poses=off))
     text = f'the heading of the pose lies {abs(degrees):.1f} degrees beside its way'
@@ -140,19 +151,12 @@ def test_a_heading_beside_the_way_is_turned_to_it(degrees, speed):
     assert np.abs(np.angle(error)).max() < np.radians(0.1)
 
 
-def test_a_heading_along_the_way_stays():
-    rng = np.random.default_rng(0)
-    wheels = odometry(DRIVING + 0.1 * rng.standard_normal(len(STAMPS)), 0.1)
-    check = check_motion(wheels)
-    assert check.corrected == [] and (check.odometry.poses == wheels.poses).all()
-
-
 def test_a_drive_whose_wheels_count_more_is_learned_with_the_scale_of_the_first():
     wheels = odometry(np.full(len(STAMPS), 1.0), 0.3)
     images = PanoramaArray(IMAGES, np.zeros((len(IMAGES), 1, 1, 3), np.uint8))
-    run = Run('first', images, wheels)
     poses, twists = wheels.poses * [1.08, 1.08, 1.0], wheels.twists * [1.08, 1.0]
-    larger = Run('larger', images, replace(wheels, poses=poses, twists=twists))
+    run = Run('first', images, wheels)
+    larger = replace(run, odometry=replace(wheels, poses=poses, twists=twists))
     rows, count = np.arange(0, len(IMAGES), 2), len(IMAGES)
     near = np.clip(rows + np.random.default_rng(0).integers(-1, 2, len(rows)), 0, count - 1)
     closures = Closures(np.column_stack([rows, count + near]), np.zeros(len(rows)))
@@ -160,4 +164,4 @@ def test_a_drive_whose_wheels_count_more_is_learned_with_the_scale_of_the_first(
     assert first is run
     np.testing.assert_allclose(second.odometry.poses, wheels.poses, atol=0.05)
     np.testing.assert_allclose(second.odometry.twists, wheels.twists, rtol=0.01)
-    assert same_scale([run, replace(run, name='equal')], closures)[1].odometry is wheels
+    assert same_scale([run, run], closures)[1].odometry is wheels

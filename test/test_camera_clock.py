@@ -4,14 +4,15 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres, panorama_config, wander
 
+from sfa_localization.camera.leveling import tilted
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.geometry import wrap_angle
-from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate
+from sfa_localization.data.run import PanoramaArray, Run, integrate
+from sfa_localization.data.sphere import Sphere
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 
 SIZE = (20, 120)
@@ -34,36 +35,19 @@ def late(run, seconds):
     return replace(run, panoramas=PanoramaArray(shifted, run.panoramas.images))
 
 
-@pytest.mark.parametrize('clockwise', [True, False])
-def test_the_columns_shift_as_the_robot_turns(clockwise):
-    run = run_of(wander(60, 1, hz=20.0), every=1, clockwise=clockwise)
-    turned = np.diff(np.unwrap(run.odometry.poses[:, 2]))
-    shifts = wrap_angle(np.diff(list(headings(run.panoramas, clockwise))))
-    assert np.median(np.abs(shifts - turned)) < 0.02
-    assert np.corrcoef(shifts, turned)[0, 1] > 0.9
-
-
 @pytest.mark.parametrize('seed', range(2))
 def test_a_delay_errs_as_it_says(seed):
     punctual = run_of(wander(400, seed, hz=20.0), seed, clockwise=seed % 2 == 0)
-    for delay in (-2.0, -0.3, -0.05, 0.0, 0.15, 0.5, 1.7):
+    for delay in (-2.0, -0.05, 0.15, 1.7):
         clock = clock_of(late(punctual, delay))
         assert clock.is_estimated and clock.std_s < 0.02
         assert abs(clock.delay_s - delay) < 3 * clock.std_s + 1e-3
 
 
-def test_frame_and_rate_of_the_odometry_and_what_the_robot_carries_in_every_image_do_not_matter():
+def test_what_the_robot_carries_in_every_image_does_not_matter():
     run = late(run_of(wander(400, 2, hz=20.0), 2), 0.2)
-    odometry, images = run.odometry, run.panoramas.images.copy()
-    turned = integrate(odometry.stamps_ns, odometry.twists, np.array([40.0, -3.0, 2.9]))
-    slow = Odometry(*(getattr(odometry, name)[::4] for name in Odometry.__slots__))
-    images[:, :, 20:35], images[:, -6:, 60:100] = 0, 255
-    for other in (
-        replace(run, odometry=replace(odometry, poses=turned)),
-        replace(run, odometry=slow),
-        replace(run, panoramas=PanoramaArray(run.panoramas.stamps_ns, images)),
-    ):
-        assert clock_of(other).delay_s == pytest.approx(0.2, abs=0.02)
+    run.panoramas.images[:, :, 20:35], run.panoramas.images[:, -6:, 60:100] = 0, 255
+    assert clock_of(run).delay_s == pytest.approx(0.2, abs=0.02)
 
 
 def driven(speed, omega, seed, hz):
@@ -74,18 +58,13 @@ def driven(speed, omega, seed, hz):
 
 
 def test_a_robot_that_shuttles_over_rough_ground_does_not_turn():
-    """Each image, of 60 degrees, is rolled and pitched by some 3 degrees."""
+    """Each image is rolled and pitched by some 3 degrees."""
     run = run_of(driven(0.6 * np.sign(np.sin(np.arange(400) / 20)), 0.0, 0, 10.0))
-    rng, (height, width) = np.random.default_rng(0), SIZE
-    azimuths = np.linspace(0, 2 * np.pi, width, endpoint=False)
-    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
-    tilted = []
-    for image in run.panoramas.images:
-        roll, pitch = rng.normal(0, 3.0 * height / 60, 2)
-        moved = rows + roll * np.sin(azimuths) + pitch * np.cos(azimuths)
-        maps = columns.astype(np.float32), moved.astype(np.float32)
-        tilted.append(cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-    panoramas = PanoramaArray(run.panoramas.stamps_ns, np.stack(tilted))
+    sphere, rng = Sphere(-0.6, 0.6), np.random.default_rng(0)
+    tilts = np.radians(3.0) * rng.normal(size=(len(run.panoramas.images), 2))
+    pairs = zip(run.panoramas.images, tilts, strict=True)
+    tilted_images = [tilted(image, tilt, sphere) for image, tilt in pairs]
+    panoramas = PanoramaArray(run.panoramas.stamps_ns, np.stack(tilted_images))
     assert np.abs(wrap_angle(np.diff(list(headings(panoramas))))).max() < 0.1
 
 

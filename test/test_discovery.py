@@ -11,11 +11,11 @@ from sfa_localization.place_model import PlaceModel
 pytest.importorskip('rclpy')
 
 from nav_msgs.msg import Odometry
-from ros_bench import until
+from ros_bench import standing, until
 from sensor_msgs.msg import CompressedImage, Image
 
 from sfa_localization.nodes import discovery
-from sfa_localization.nodes.conversions import to_image, to_odometry
+from sfa_localization.nodes.conversions import to_image
 from sfa_localization.nodes.ekf_node import EkfNode
 from sfa_localization.nodes.omnicam_node import OmnicamNode
 from sfa_localization.nodes.sfa_node import SfaNode
@@ -31,9 +31,9 @@ def impatient(monkeypatch):
 
 def announce(bench, node, kind, *names):
     """Publishers of these topics, which the node knows of."""
-    made = [bench.node.create_publisher(kind, name, 10) for name in names]
+    for name in names:
+        bench.node.create_publisher(kind, name, 10)
     assert until(lambda: all(node.count_publishers(name) for name in names))
-    return made
 
 
 def takes_another(node, topic):
@@ -43,10 +43,8 @@ def takes_another(node, topic):
 
 def test_inputs_of_another_name_are_taken(bench):
     node = bench.run(EkfNode)
-    zero, unit, frames = np.zeros(3), np.eye(3), ('odom', 'base_link')
-    message = to_odometry(zero, unit, zero[:2], unit[:2, :2], STAMP_NS, frames)
     used = node.monitors['odom']
-    assert bench.publish_until('/wheel_odometry', message, lambda: used.received)
+    assert bench.publish_until('/wheel_odometry', standing(STAMP_NS), lambda: used.received)
     assert node.full_name('odom') == '/wheel_odometry', 'diagnostics name the topic that is used'
     announce(bench, node, Odometry, '/odom')
     assert until(lambda: node.full_name('odom') == '/odom'), 'its own name comes first'
@@ -57,21 +55,22 @@ def test_inputs_of_another_name_are_taken(bench):
     assert node.full_name('image_raw') == '/camera/image'
 
 
-@pytest.mark.parametrize(('others', 'arguments'), [
-    (['/a', '/b'], []), (['/a', '/odom'], []),
-    (['/a'], ['--ros-args', '-r', 'odom:=/mine']),
-    (['/robot2/wheels'], ['--ros-args', '-r', '__ns:=/robot1']),
+@pytest.mark.parametrize(('others', 'rule'), [
+    (['/a', '/b'], ''), (['/a', '/odom'], ''), (['/a'], 'odom:=/mine'),
+    (['/robot2/wheels'], '__ns:=/robot1'),
 ])  # fmt: skip
-def test_where_there_is_a_choice_it_is_not_made(bench, others, arguments):
+def test_where_there_is_a_choice_it_is_not_made(bench, others, rule):
     """Nor where the topic has been heard."""
-    node = bench.run(EkfNode, options={'cli_args': arguments})
+    node = bench.run(EkfNode, options={'cli_args': ['--ros-args', '-r', rule] if rule else []})
     announce(bench, node, Odometry, *others)
     assert not takes_another(node, 'odom')
-    if not arguments:
-        node = bench.run(EkfNode)
-        node.monitors['odom'].receive()
-        announce(bench, node, Odometry, '/wheels')
-        assert not takes_another(node, 'odom')
+
+
+def test_a_topic_that_has_been_heard_is_kept(bench):
+    node = bench.run(EkfNode)
+    node.monitors['odom'].receive()
+    announce(bench, node, Odometry, '/wheels')
+    assert not takes_another(node, 'odom')
 
 
 IMAGES = 'image:=NAME or panorama:=NAME'
@@ -100,19 +99,16 @@ def test_the_output_of_another_localizer_is_no_sensor(bench, kind, other, topics
     assert all(name in hint for name in topics) and hint.endswith(f': {arguments}')
 
 
-@pytest.mark.parametrize(('kind', 'settings'), [
-    (OmnicamNode, {'silence_timeout': 0.05, 'image_transport': 'compressed'}),
-    (SfaNode, {'model': 'a.npz'}),
-])  # fmt: skip
-def test_without_images_the_diagnostics_name_those_that_there_are(
-    bench, monkeypatch, kind, settings
-):
+def test_without_images_the_diagnostics_name_those_that_there_are(bench, monkeypatch):
     """Of both types: another `image_transport` may be all that is wrong."""
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
-    node = bench.run(kind, **settings)
-    announce(bench, node, Image, '/a', '/b')
-    announce(bench, node, CompressedImage, '/a/packed', '/b/packed')
+    both = ((Image, '/a'), (Image, '/b'), (CompressedImage, '/c'), (CompressedImage, '/d'))
+    for kind, name in both:
+        bench.node.create_publisher(kind, name, 10)
     bench.node.create_subscription(Image, 'panorama', lambda _: None, 1)
     words = [f'/{name} (sensor_msgs/msg/Image)' for name in 'ab']
-    words += [f'/{name}/packed (sensor_msgs/msg/CompressedImage)' for name in 'ab']
-    assert until(lambda: all(word in node.health()[1] for word in words))
+    words += [f'/{name} (sensor_msgs/msg/CompressedImage)' for name in 'cd']
+    camera = {'silence_timeout': 0.05, 'image_transport': 'compressed'}
+    for kind, settings in ((SfaNode, {'model': 'a.npz'}), (OmnicamNode, camera)):
+        node = bench.run(kind, **settings)
+        assert until(lambda n=node: all(word in n.health()[1] for word in words)), node.health()

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from picture_readers import SIZE, PictureReader
+from picture_readers import PictureReader
 from robustness import promises
 from study.__main__ import study_parser
 
@@ -50,23 +50,18 @@ FOREIGN = {'source', 'colcon', 'rviz2', 'rosdep', 'git', 'cd', 'mkdir', 'pip', '
 FOREIGN_ROS = {'run robot_localization', 'launch nav2_bringup', 'bag record', 'topic echo'}
 
 
-def command_lines() -> list[str]:
-    """Return every command line of the pages."""
-    lines = []
-    for text in PAGES.values():
-        blocks = ''.join(BLOCK.findall(text)).replace('\\\n', ' ')
-        lines += [*blocks.splitlines(), *INLINE.findall(text)]
-    return [line for line in lines if shlex.split(line, comments=True)]
-
-
 def test_every_command_exists():
-    lines, wrong = command_lines(), {}
-    for line in lines:
+    blocks = ''.join(''.join(BLOCK.findall(text)) for text in PAGES.values()).replace('\\\n', ' ')
+    inline = [line for text in PAGES.values() for line in INLINE.findall(text)]
+    count, wrong = 0, {}
+    for line in [*blocks.splitlines(), *inline]:
+        words = shlex.split(line, comments=True)
+        count += bool(words)
         try:
-            check(*shlex.split(line, comments=True))
+            check(*words) if words else None
         except (AssertionError, SystemExit, ValueError, subprocess.CalledProcessError) as error:
             wrong[line] = repr(error)
-    assert len(lines) > 50 and wrong == {}
+    assert count > 50 and wrong == {}
 
 
 def check(program: str, *words: str) -> None:
@@ -77,10 +72,12 @@ def check(program: str, *words: str) -> None:
         if targets == ['study'] and words[1:]:
             study_parser().parse_args(shlex.split(words[1].removeprefix('ARGS=')))
         subprocess.run(['make', '--dry-run', *targets], cwd=ROOT, check=True, capture_output=True)
-    elif program == 'python' and words[:2] == ('-m', 'sfa_localization'):
+    elif (program, *words[:2]) == ('python', '-m', 'sfa_localization'):
         check_command(*words[2:])
-    elif program == 'sfa_localization' or program in NODES:
-        check_command(*(() if program == 'sfa_localization' else (program,)), *words)
+    elif program == 'sfa_localization':
+        check_command(*words)
+    elif program in NODES:
+        check_command(program, *words)
     else:
         assert program in FOREIGN, f'unknown program {program}'
 
@@ -142,9 +139,8 @@ def test_the_table_of_topics_is_that_of_the_nodes(bench, monkeypatch):
     from sfa_localization.nodes import ekf_node, omnicam_node, sfa_node
 
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
-    size = {'width': SIZE.width, 'height': SIZE.height}
     nodes = [
-        bench.run(omnicam_node.OmnicamNode, camera_model='panorama', level_by_imu=True, **size),
+        bench.run(omnicam_node.OmnicamNode, camera_model='panorama', level_by_imu=True),
         bench.run(sfa_node.SfaNode, model='model.npz'),
         bench.run(ekf_node.EkfNode),
     ]
@@ -169,18 +165,19 @@ def test_the_printed_inspection_is_that_of_the_sample(capsys, monkeypatch):
     monkeypatch.chdir(ROOT)
     assert cli.main(['inspect', 'bags/sample']) == 0
     printed = re.search(r'```text\n(.*?)```', PAGES['bags/README.md'], re.DOTALL)[1]
-    assert re.sub(r'-?[\d.]+', '#', capsys.readouterr().out).split() == (
-        re.sub(r'-?[\d.]+', '#', printed).split()
-    )
+    texts = printed, capsys.readouterr().out
+    page, told = (re.sub(r'-?[\d.]+', '#', text).split() for text in texts)
+    assert page == told
 
 
 def test_foxglove_layout_is_complete_and_its_topics_exist():
     layout = json.loads((ROOT / 'config/foxglove_layout.json').read_text('utf-8'))
-    panels = set(re.findall(r'"([A-Za-z0-9]+![a-z]+)"', json.dumps(layout['layout'])))
-    assert panels == set(layout['configById'])
-    named = set(layout['configById']['3D!map']['topics'])
-    named.add(layout['configById']['Image!panorama']['imageMode']['imageTopic'])
-    for panel in layout['configById'].values():
+    assert set(re.findall(r'"(\w+![a-z]+)"', json.dumps(layout['layout']))) == {
+        *layout['configById']
+    }
+    panels = layout['configById']
+    named = {*panels['3D!map']['topics'], panels['Image!panorama']['imageMode']['imageTopic']}
+    for panel in panels.values():
         named.update(path['value'].partition('.')[0] for path in panel.get('paths', ()))
     assert {name.lstrip('/') for name in named} <= topics()
 
@@ -191,16 +188,14 @@ def test_robot_localization_finds_a_robot_that_starts_anywhere(launch):
     settings = yaml.safe_load(text)['ekf_filter_node_map']['ros__parameters']
     assert settings['pose0'].lstrip('/') in topics()
     assert len(settings['pose0_config']) == len(settings['odom0_config']) == 15
-    used = [index for index, wanted in enumerate(settings['pose0_config']) if wanted]
-    assert used == [0, 1, 5], 'x, y and yaw'
+    used = np.flatnonzero(settings['pose0_config'])
+    assert used.tolist() == [0, 1, 5], 'x, y and yaw'
     covariance = np.reshape(settings['initial_estimate_covariance'], (15, 15))
     distant = np.array([200.0, -200.0, math.pi])
     d2 = distant @ np.linalg.solve(covariance[np.ix_(used, used)], distant)
     assert d2 <= settings['pose0_rejection_threshold'] ** 2
-    lines = PAGES['config/robot_localization.md'].splitlines()
-    (line,) = (line for line in lines if line.startswith('ros2 launch'))
-    arguments = dict(word.split(':=') for word in shlex.split(line)[4:])
-    assert [*launch(**arguments)] == ['omnicam_node', 'sfa_node'], 'no second filter'
+    (line,) = re.findall('^ros2 launch (.*)$', PAGES['config/robot_localization.md'], re.M)
+    assert [*launch(**given(line))] == ['omnicam_node', 'sfa_node'], 'no second filter'
 
 
 def test_nav2_uses_our_frames():
@@ -214,8 +209,7 @@ def test_nav2_uses_our_frames():
     assert navigator['global_frame'] == frames.map_frame
     assert navigator['robot_base_frame'] == monitor['base_frame_id'] == frames.base_frame
     assert monitor['odom_frame_id'] == frames.odom_frame
-    topics_of_odometry = {navigator['odom_topic'], controller['odom_topic']}
-    assert topics_of_odometry == {'odom'}, 'an absolute topic would be that of another robot'
+    assert navigator['odom_topic'] == controller['odom_topic'] == 'odom', 'not of another robot'
     window = settings['global_costmap']['global_costmap']['ros__parameters']
     assert window['rolling_window'] is True
     assert window['plugins'] == ['obstacle_layer', 'inflation_layer']
@@ -237,6 +231,11 @@ def launch_file(monkeypatch):
         classes = dict.fromkeys(names.split(', '), Recorded)
         monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**classes))
     return runpy.run_path(str(path))
+
+
+def given(line):
+    """The arguments NAME:=VALUE of a command line."""
+    return dict(word.split(':=') for word in shlex.split(line, comments=True) if ':=' in word)
 
 
 @pytest.fixture
@@ -262,8 +261,12 @@ def launch(launch_file):
 
 
 def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
-    """The transform stays in the namespace unless asked; nodes can be left out."""
-    launched, without = launch(model='model.npz'), launch(panorama='/panorama')
+    """The transform stays in the namespace unless asked; nodes can be left out, as in README.md,
+    whose bag holds panoramas.
+    """
+    (block,) = (block for block in BLOCK.findall(PAGES['README.md']) if 'ros2 bag play' in block)
+    typed, played = block.splitlines()
+    launched, without = launch(model='model.npz'), launch(**given(typed))
     assert [*launched] == list(NODES) and [*without] == ['sfa_node', 'ekf_node']
     for node in [*launched.values(), *without.values()]:
         assert set(node['parameters'][1]) <= parameters()
@@ -272,7 +275,11 @@ def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
     assert ('/tf', 'tf') in launched['ekf_node']['remappings']
     assert ('/tf', '/tf') in launch(tf='/tf')['ekf_node']['remappings']
     assert [*launch(ekf='false')] == ['omnicam_node', 'sfa_node']
-    assert ('panorama', '/panorama') in without['sfa_node']['remappings']
+    assert without['sfa_node']['parameters'][1]['image_transport'] == 'compressed'
+    panorama = dict(without['sfa_node']['remappings'])['panorama']
+    odometry = dict(without['ekf_node']['remappings'])['odom']
+    with Bag(ROOT / played.split()[3]) as bag:
+        assert {f'{panorama}/compressed', f'/{odometry}'} <= set(bag.topics)
     with pytest.raises(FileNotFoundError, match=r'config:=/nowhere\.yaml'):
         launch(config='/nowhere.yaml')  # launch_ros itself only warns, and starts with defaults
 
@@ -293,20 +300,6 @@ def test_a_launch_ends_with_what_cannot_start_and_starts_again_what_dies(launch,
     for code in (0, DIED, -9, -11):
         assert exited(code, running) is None
     assert exited(CANNOT_START, ending) is None
-
-
-def test_the_replay_of_the_readme_feeds_the_launched_nodes(launch):
-    (block,) = (block for block in BLOCK.findall(PAGES['README.md']) if 'ros2 bag play' in block)
-    typed, played = (shlex.split(line, comments=True) for line in block.splitlines())
-    launched = launch(**dict(word.split(':=') for word in typed[4:]))
-    assert [*launched] == ['sfa_node', 'ekf_node'], 'the bag holds panoramas'
-    assert launched['sfa_node']['parameters'][1]['image_transport'] == 'compressed'
-    panorama, odometry = (
-        dict(launched[node]['remappings'])[topic]
-        for node, topic in (('sfa_node', 'panorama'), ('ekf_node', 'odom'))
-    )
-    with Bag(ROOT / played[3]) as bag:
-        assert {f'{panorama}/compressed', f'/{odometry}'} <= set(bag.topics)
 
 
 def test_pages_name_tests_that_exist():

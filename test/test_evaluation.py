@@ -22,8 +22,6 @@ from sfa_localization.fusion.belief import DrivenPath
 from sfa_localization.fusion.health import health_of
 from sfa_localization.place_model import PlaceModel
 
-TRUSTED = DrivenPath(placed_m=(-math.inf,))
-
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
@@ -62,25 +60,13 @@ def test_evaluate_judges_pictures_by_the_section_of_sfa_node(bag, tmp_path, caps
     assert skipped['image is unlike all training images'] == 4 + 3
 
 
-@pytest.mark.parametrize('command', ['evaluate', 'tune'])
-def test_a_parameter_file_for_other_panoramas_is_refused(command, bag, tmp_path, capsys):
-    write_config(tmp_path / 'own.yaml', {'omnicam_node': {'elevation_max': 30.0}})
-    arguments = {
-        'evaluate': ['evaluate', 'reader.npz', str(bag)],
-        'tune': ['tune', str(bag), '--model', 'reader.npz', '--output', str(tmp_path / 'new.yaml')],
-    }
-    assert main([*arguments[command], '--config', str(tmp_path / 'own.yaml')]) == 1
+@pytest.mark.parametrize('words', ['evaluate reader.npz {}', 'tune {} --model a.npz --output b'])
+def test_a_parameter_file_for_other_panoramas_is_refused(words, bag, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_config('own.yaml', {'omnicam_node': {'elevation_max': 30.0}})
+    assert main([*words.format(bag).split(), '--config', 'own.yaml']) == 1
     assert 'elevation_max 30.0 instead of 24.0' in capsys.readouterr().err
-    assert not (tmp_path / 'new.yaml').exists()
-
-
-class Torn(PictureReader):
-    """Reads positions beyond x = 7 m as ten meters farther."""
-
-    def locate(self, image):
-        observation = super().locate(image)
-        shift = np.array([10.0 if observation.position[0] > 7 else 0.0, 0.0, 0.0])
-        return replace(observation, pose=observation.pose + shift)
+    assert [path.name for path in tmp_path.iterdir()] == ['own.yaml']
 
 
 def test_what_the_filter_rejected_and_how_long_it_was_sure_or_wrong_is_printed(
@@ -95,9 +81,18 @@ def test_what_the_filter_rejected_and_how_long_it_was_sure_or_wrong_is_printed(
     assert seconds['LOCALISED'] > 1.0 and counts['false_localised_s'] == 0.0
     assert f'state: UNINITIALISED {seconds["UNINITIALISED"]:.1f} s, ' in out
     assert 'an error of more than a meter' not in out
-    monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: Torn()))
+    locate = PictureReader.locate
+
+    def torn(reader, image):
+        """Reads positions beyond x = 7 m as ten meters farther."""
+        seen = locate(reader, image)
+        shift = np.array([10.0 if seen.position[0] > 7 else 0.0, 0.0, 0.0])
+        return replace(seen, pose=seen.pose + shift)
+
+    monkeypatch.setattr(PictureReader, 'locate', torn)
     # Driving would notice it.
-    monkeypatch.setattr(pose_filter, 'health_of', lambda *_: health_of(TRUSTED, ()))
+    trusted = DrivenPath(placed_m=(-math.inf,))
+    monkeypatch.setattr(pose_filter, 'health_of', lambda *_: health_of(trusted, ()))
     counts = evaluated(bag, tmp_path)['counts']
     wrong, localised = counts['false_localised_s'], counts['states_s']['LOCALISED']
     assert 0.5 * localised < wrong <= localised
@@ -105,20 +100,17 @@ def test_what_the_filter_rejected_and_how_long_it_was_sure_or_wrong_is_printed(
     assert line in capsys.readouterr().out
 
 
-def spread_out(seed, covariance, yaw_std=0.1, count=4000):
-    """A true path, and estimates of it whose errors have a covariance, in a turned map."""
-    rng = np.random.default_rng(seed)
-    stamps = np.arange(count) * 100_000_000
+def spread_out(seed, covariance, count=4000):
+    """A true path, and estimates of it whose errors have a covariance."""
+    rng, stamps = np.random.default_rng(seed), np.arange(count) * 100_000_000
     truth = np.column_stack([rng.uniform(0, 9, (count, 2)), rng.uniform(-3, 3, count)])
     error = rng.multivariate_normal([0.0, 0.0], covariance, count)
-    yaw = rng.normal(0, yaw_std, count)
-    poses = truth + np.column_stack([error, yaw])
+    poses = truth + np.column_stack([error, rng.normal(0, 0.1, count)])
     return Trajectory(stamps, truth), Trajectory(stamps, poses)
 
 
 def test_regions_of_95_percent_hold_what_they_say_in_a_turned_map():
-    inside_map = np.diag([0.09, 0.0009])
-    turn = rotation(1.0)
+    inside_map, turn = np.diag([0.09, 0.0009]), rotation(1.0)
     truth, estimate = spread_out(0, turn @ inside_map @ turn.T)
     claimed = np.zeros((4000, 3, 3))
     claimed[:, :2, :2], claimed[:, 2, 2] = inside_map, 0.01
@@ -128,8 +120,6 @@ def test_regions_of_95_percent_hold_what_they_say_in_a_turned_map():
     assert right['nees'] == pytest.approx(1.0, abs=0.08)
     sure = evaluation.calibration(truth, estimate, turn, claimed / 9)
     assert sure['within_95'] < 0.4 and sure['yaw_within_95'] < 0.6 and sure['nees'] > 8
-    unturned = evaluation.calibration(truth, estimate, rotation(0.0), claimed)
-    assert unturned['within_95'] < 0.7
 
 
 @pytest.mark.parametrize('memory', [0.0, 0.95])

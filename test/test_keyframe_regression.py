@@ -47,59 +47,40 @@ class KeyframeSquare:
         return fit_among(self.seen(place, more), self.kept, self.places, self.columns)
 
 
-def fit_among(image, keyframes, places, columns, channels=None, drives=None) -> Fit:
+def fit_among(image, keyframes, places, columns, channels=None) -> Fit:
     """The fit of a spectrum (rows, F) on which roll and pitch have no effect."""
     channels = channels or (slice(0, keyframes.shape[1]),)
-    drives = np.zeros(len(places), np.int32) if drives is None else drives
     by_turn = (image * 1j * np.arange(image.shape[1])).astype(np.complex64)
     changes = np.stack([image, 0 * image, 0 * image, by_turn])
-    return regress(changes, keyframes, places, drives, channels, columns)
+    return regress(changes, keyframes, places, np.zeros(len(places), np.int32), channels, columns)
 
 
 @SIZES
-def test_a_place_between_keyframes_is_measured_whatever_the_rest_of_the_angle(columns):
+@pytest.mark.parametrize('place', [(0.2, -0.3), (-0.4, 0.4)])
+def test_a_place_between_keyframes_is_measured_whatever_the_rest_of_the_angle(columns, place):
     scene = KeyframeSquare(columns)
-    for place in ((0.0, 0.0), (0.2, -0.3), (-0.4, 0.4)):
-        fit = scene.fit(place)
-        assert np.allclose(fit.place, place, atol=0.01)
-        assert np.abs(fit.changes).max() < 5e-3 and 0 <= fit.unlike < 1e-3
-        assert np.allclose([*fit.shares @ scene.places, fit.shares.sum()], [*fit.place, 1])
-    for angle in (-0.02, 0.03):
-        image = turned(scene.seen((0.1, 0.2))[None], np.array([angle]))[0]
-        fit = fit_among(image, scene.kept, scene.places, columns)
-        assert fit.changes == pytest.approx([0.0, 0.0, angle], rel=0.1)
-        assert np.allclose(fit.place, (0.1, 0.2), atol=0.02)
+    fit = scene.fit(place)
+    assert np.allclose(fit.place, place, atol=0.01)
+    assert np.abs(fit.changes).max() < 5e-3 and 0 <= fit.unlike < 1e-3
+    assert np.allclose([*fit.shares @ scene.places, fit.shares.sum()], [*fit.place, 1])
+    image = turned(scene.seen(place)[None], np.array([0.03]))[0]
+    fit = fit_among(image, scene.kept, scene.places, columns)
+    assert fit.changes == pytest.approx([0.0, 0.0, 0.03], abs=3e-3)
+    assert np.allclose(fit.place, place, atol=0.02)
 
 
-def test_what_no_place_explains_is_unlike_and_moves_little_and_no_texture_is_finite():
+def test_what_no_place_explains_is_unlike_and_moves_little():
     scene = KeyframeSquare()
     for share in (0.5, 1.0):
         fit = scene.fit((0.2, 0.1), share * scene.strange)
         assert fit.unlike == pytest.approx(share**2, rel=0.3)
         assert np.allclose(fit.place, (0.2, 0.1), atol=0.1)
-    for level in (0.0, 1.0):
-        same = np.repeat(spectrum(np.full((ROWS, 60), level, np.float32))[None], 64, axis=0)
-        fit = fit_among(same[0], same, scene.places, 60)
-        assert np.isfinite([*fit.place, *fit.changes, fit.unlike, fit.variance]).all()
-        assert np.abs(fit.place).max() <= 0.5
-
-
-def test_keyframes_along_a_line_in_another_light_show_the_place_across_it():
-    scene, place = KeyframeSquare(), (0.2, 0.3)
-    light = scene.strange / 2
-    line = np.column_stack([np.linspace(-0.5, 0.5, 12), np.zeros(12)])
-    lit, everywhere = scene.keyframes(line, light), np.concatenate([scene.places, line])
-    drives = np.repeat([0, 1], [64, 12]).astype(np.int32)
-    assert abs(fit_among(scene.seen(place, light), lit, line, 60).place[1]) < 0.01
-    keyframes = np.concatenate([scene.kept, lit])
-    fit = fit_among(scene.seen(place, light), keyframes, everywhere, 60, drives=drives)
-    assert np.hypot(*(fit.place - place)) < 0.15
 
 
 NOISE = spectrum(2 * smooth(np.random.default_rng(9), 60))
 
 
-@pytest.mark.parametrize('spoil', [np.negative, np.zeros_like, lambda image: image + NOISE])
+@pytest.mark.parametrize('spoil', [np.negative, lambda image: image + NOISE])
 def test_a_channel_that_shows_something_else_counts_little(spoil):
     """Two channels of the same scene, the second of the image spoilt."""
     scene, place = KeyframeSquare(), np.array([0.3, -0.2])
@@ -110,23 +91,3 @@ def test_a_channel_that_shows_something_else_counts_little(spoil):
     fit = fit_among(image, keyframes, scene.places, 60, channels)
     assert np.hypot(*(fit.place - place)) < 0.03
     assert fit.unlike < 0.3 * plain.unlike
-
-
-def lit(rng, columns, share):
-    """What a light adds to a texture: other things in each sector of 22.5 degrees."""
-    sectors = np.repeat(rng.normal(size=(ROWS, 16)), -(-columns // 16), axis=1)[:, :columns]
-    return share * normalized((sectors * rng.normal(1.0, 0.3, sectors.shape)).astype(np.float32))
-
-
-@SIZES
-@pytest.mark.parametrize('share', [0.1, 0.5])
-def test_the_variance_is_what_light_moves_the_place_by(columns, share):
-    scene, rng, place = KeyframeSquare(columns), np.random.default_rng(7), np.array([0.1, -0.2])
-    fits = [scene.fit(place, lit(rng, columns, share)) for _ in range(300)]
-    true = np.mean([np.sum((fit.place - place) ** 2) for fit in fits]) / 2
-    assert 0.6 < np.mean([fit.variance for fit in fits]) / true < 1.7
-
-
-def test_a_place_beside_all_keyframes_is_seen_to_be():
-    inside, border, outside = (KeyframeSquare().fit((x, 0.0)).outward for x in (0.0, 0.5, 1.5))
-    assert inside < 0.2 and 0.5 < border < 0.9 and outside > 0.9

@@ -5,7 +5,6 @@
 from dataclasses import replace
 from functools import cache
 
-import cv2
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres, alone, learnt_keyframes
@@ -13,12 +12,10 @@ from cylinder_worlds import Spheres, alone, learnt_keyframes
 from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import wrap_angle
-from sfa_localization.keyframes.errors import ErrorModel
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.location import Location
 from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.keyframes.training import choose_keyframes
-from sfa_localization.metric.keyframe_map import usual_turn_std
 
 CONFIG = PanoramaConfig(width=120, height=24)
 COUNTER = replace(CONFIG, clockwise=False)
@@ -95,45 +92,33 @@ def familiar(location: Location) -> bool:
     return location.fit.explained >= WatchConfig().least_explained
 
 
-@pytest.mark.parametrize('config', [CONFIG, COUNTER])
-def test_an_unseen_pose_is_located(config):
-    far, turned, locations = errors_at(unseen(), config=config)
-    assert np.median(far) < 0.03 and np.mean(far) < 0.05
-    assert np.median(turned) < np.radians(2)
-    assert min(location.fit.explained for location in locations) > 0.9
-
-
-@pytest.mark.parametrize(('seed', 'number', 'covered'), [(1, 150, 0), (0, 60, 30), (0, 60, 60)])
-def test_the_ellipses_hold_what_they_promise_also_where_a_part_is_covered(seed, number, covered):
-    mask, poses = (np.arange(CONFIG.width) >= covered)[:, None], unseen(number)
-    far, _, locations = errors_at(poses, Spheres.about(seed), change=lambda images: images * mask)
-    assert within(locations, poses) > 0.85 and np.median(far) < 0.6
-    assert np.mean([*map(familiar, locations)]) > (0.8 if covered == 60 else 0.99)
-
-
 LIGHTS = {
-    'darker': lambda i: i * 0.5,
-    'gamma': lambda i: 255 * (i / 255) ** 1.6,
-    'sun': lambda i: (
-        i * (1 + 0.4 * np.cos(np.arange(i.shape[2]) * 2 * np.pi / i.shape[2]))[:, None]
-    ),
-    'color': lambda i: i * np.array([0.6, 1.0, 1.3]),
+    'usual': (CONFIG, lambda images: images),
+    'sun': (CONFIG, sunny),
+    'dark and red': (COUNTER, lambda images: images * np.array([0.3, 0.5, 0.65])),
 }
 
 
 @pytest.mark.parametrize('light', LIGHTS)
-def test_light_does_not_matter(light):
-    usual, _, _ = errors_at(unseen())
-    far, turned, locations = errors_at(unseen(), change=LIGHTS[light])
-    assert np.mean(usual) < 0.03 and np.mean(far) < 0.08
+def test_an_unseen_pose_is_located_in_any_light(light):
+    config, change = LIGHTS[light]
+    far, turned, locations = errors_at(unseen(), config=config, change=change)
+    assert np.mean(far) < (0.03 if light == 'usual' else 0.08)
     assert np.median(turned) < np.radians(2)
-    assert min(location.fit.explained for location in locations) > 0.9
+    assert min(location.fit.explained for location in locations) > 0.85
+
+
+@pytest.mark.parametrize(('covered', 'least'), [(0, 0.99), (60, 0.8)])
+def test_the_ellipses_hold_what_they_promise_also_where_a_part_is_covered(covered, least):
+    mask, poses = (np.arange(CONFIG.width) >= covered)[:, None], unseen(100)
+    far, _, locations = errors_at(poses, change=lambda images: images * mask)
+    assert within(locations, poses) > 0.85 and np.median(far) < 0.6
+    assert np.mean([*map(familiar, locations)]) > least
 
 
 STRANGE = {
     'foreign': lambda images: Spheres.about(9).panoramas(unseen(20), CONFIG),
     'mirrored': lambda images: images[:, :, ::-1],
-    'noise': lambda images: np.random.default_rng(5).integers(0, 255, images.shape),
     'black': np.zeros_like,
 }
 
@@ -150,7 +135,7 @@ def test_what_was_never_seen_is_not_believed(kind):
 def test_a_symmetric_world_is_ambiguous():
     """Places that look alike are uncertain; in the middle, where four headings do, the heading."""
     world, poses = Spheres.about(2).symmetric(), unseen(12)
-    keyframes = replace(learnt(world), errors=ErrorModel())
+    keyframes = keyframes_of([world.panoramas(drive(), CONFIG)], [drive()], [0])
     _, _, locations = errors(keyframes, world.panoramas(poses, CONFIG), poses)
     assert np.mean(stds(locations) > 0.5) > 0.7
     poses *= np.array([0.05, 0.05, 1.0])
@@ -159,17 +144,7 @@ def test_a_symmetric_world_is_ambiguous():
     assert all(location.covariance[2, 2] > 1.0 for location in locations)
 
 
-def test_they_are_saved_and_read():
-    drives = np.arange(len(learnt(HOME).poses), dtype=np.int32) % 3
-    keyframes = replace(learnt(HOME), drives=drives, trained=2)
-    again = Keyframes.from_arrays(keyframes.to_arrays(), keyframes.sphere)
-    assert np.array_equal(again.first, keyframes.first) and again.errors == keyframes.errors
-    for image in HOME.panoramas(unseen(5), CONFIG):
-        a, b = alone(keyframes, image), alone(again, image)
-        assert np.array_equal(a.pose, b.pose) and np.array_equal(a.covariance, b.covariance)
-
-
-@pytest.mark.parametrize('lit', [(0,), (1,), ()])
+@pytest.mark.parametrize('lit', [(1,), ()])
 def test_drives_in_the_same_light_get_one_number(lit):
     """Together they are nearer to any place, and locate images better."""
     poses = [drive(0.5) + np.array([step, step, 0.0]) for step in (0.0, 0.13, 0.27)]
@@ -177,13 +152,13 @@ def test_drives_in_the_same_light_get_one_number(lit):
     for number in lit:
         parts[number] = sunny(parts[number])
     keyframes = keyframes_of(parts, poses, [3, 5, 7])
-    numbers = {(0,): [0, 1, 1], (1,): [0, 1, 0], (): [0, 0, 0]}[lit]
+    numbers = [0, 1, 0] if lit else [0, 0, 0]
     assert keyframes.drives.tolist() == np.repeat(numbers, len(poses[0])).tolist()
     assert keyframes.first.all() and keyframes.trained == max(numbers) + 1
     if not lit:
-        images = HOME.panoramas(unseen(), CONFIG)
-        off, turned, _ = errors(keyframes, images, unseen())
-        worse, *_ = errors(keyframes_of(parts[:1], poses[:1], [0]), images, unseen())
+        images = HOME.panoramas(unseen(30), CONFIG)
+        off, turned, _ = errors(keyframes, images, unseen(30))
+        worse, *_ = errors(keyframes_of(parts[:1], poses[:1], [0]), images, unseen(30))
         assert off.mean() < min(worse.mean(), 0.1) and np.degrees(turned.mean()) < 1.0
 
 
@@ -192,37 +167,33 @@ def test_drives_that_do_not_meet_keep_their_numbers():
     parts = [Spheres.about(n).panoramas(drive(0.5), CONFIG) for n in (0, 1)]
     keyframes = keyframes_of(parts, poses, [0, 1])
     assert set(keyframes.drives.tolist()) == {0, 1} and keyframes.first.all()
-    off, turned, _ = errors(keyframes, HOME.panoramas(unseen(), CONFIG), unseen())
-    assert off.mean() < 0.1 and np.degrees(turned.mean()) < 1.0
 
 
 def test_each_drive_of_the_training_shows_the_place_in_its_light():
     """Images in the light of a drive lie where that drive alone puts them, or better."""
     world, poses = Spheres.about(1), [drive(0.57), drive(0.57) + 0.05]
-    plain = [world.panoramas(at, CONFIG) for at in (*poses, unseen())]
+    plain = [world.panoramas(at, CONFIG) for at in (*poses, unseen(30))]
     both = keyframes_of([plain[0], sunny(plain[1])], poses, [0, 1])
     alike = keyframes_of(plain[:1], poses[:1], [0])
     unlike = keyframes_of([sunny(plain[1])], poses[1:], [0])
     for images, best, worst in ((plain[2], alike, unlike), (sunny(plain[2]), unlike, alike)):
         of_both, of_best, of_worst = (
-            errors(keyframes, images, unseen())[0].mean() for keyframes in (both, best, worst)
+            errors(keyframes, images, unseen(30))[0].mean() for keyframes in (both, best, worst)
         )
         assert of_both < 1.25 * of_best and of_both < of_worst / 2
 
 
-@pytest.mark.parametrize(('often', 'everywhere', 'number'), [(0, 4000, 2000), (9000, 16000, 3200)])
-def test_many_images_are_thinned_evenly(often, everywhere, number):
+def test_many_images_are_thinned_evenly(often=9000, everywhere=16000, reach=20):
     """Two keyframes on each square meter of a large place, however often the robot came by."""
     rng = np.random.default_rng(0)
-    reach = 5 if everywhere == 4000 else 20
     places = rng.uniform(-5, 3, (often, 2)), rng.uniform(-reach, reach, (everywhere, 2))
     poses = np.column_stack([np.concatenate(places), np.zeros(often + everywhere)])
     textures = quantized(rng.normal(size=(len(poses), 8, 12)).astype(np.float32))
     drives = np.zeros(len(poses), np.int32)
     keyframes, rows = choose_keyframes(textures, poses, CONFIG.sphere, drives)
-    assert len(rows) == number and np.array_equal(keyframes.poses, poses[rows])
+    assert len(rows) == 3200 and np.array_equal(keyframes.poses, poses[rows])
     counts, _, _ = np.histogram2d(*poses[rows, :2].T, bins=np.arange(-reach, reach + 1))
-    assert counts.min() >= 1 and counts.max() <= 1.5 * number / counts.size
+    assert counts.min() >= 1 and counts.max() <= 1.5 * len(rows) / counts.size
 
 
 def test_too_few_images_are_refused():
@@ -231,32 +202,9 @@ def test_too_few_images_are_refused():
         choose_keyframes(textures, np.zeros((3, 3)), CONFIG.sphere, drives)
 
 
-def posts() -> np.ndarray:
-    """A panorama of brown posts before a blue sky."""
-    image = np.full((24, 120, 3), (220, 190, 170), np.uint8)
-    for start in np.random.default_rng(2).permutation(15)[:9] * 8:
-        image[6:, start : start + 6] = 40, 60, 90
-    return image
-
-
-def test_color_weighs_about_as_much_as_brightness_and_a_gray_camera_has_none():
-    image, rows = posts(), (16, 24)
-    parts = [np.linalg.norm(part) for part in np.split(texture(image), rows)]
-    assert max(parts) < 3 * min(parts)
-    gray = np.repeat(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)[:, :, None], 3, axis=2)
-    assert all(np.ptp(part) < 1e-6 for part in np.split(texture(gray), rows)[1:])
-    tinted = (image * np.array([0.8, 1.0, 0.9])).astype(np.uint8)
-    assert float((texture(image) * texture(tinted)).sum()) > 0.97, 'whatever the white balance'
-
-
 def test_images_beyond_the_keyframes_say_how_uncertain_their_place_is_and_those_among_do_not():
     rng = np.random.default_rng(1)
     columns = rng.uniform(2.0, 3.0, 60), rng.uniform(-1.5, 1.5, 60), rng.uniform(-3.0, 3.0, 60)
     (_, _, outside), (_, _, among) = errors_at(np.column_stack(columns)), errors_at(unseen())
     assert all(map(familiar, outside)) and within(outside, np.column_stack(columns)) > 0.85
     assert np.quantile(stds(among), 0.9) < 0.02 < np.median(stds(outside))
-
-
-def test_a_loose_stretch_does_not_make_all_headings_uncertain():
-    stds = np.array([0.01] * 9 + [0.5])
-    assert usual_turn_std(np.diag(stds**2)) == pytest.approx(0.01)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """ekf_node and sfa_node as processes: signals, bad parameters and arguments, exit codes."""
 
+import re
 import signal
 import subprocess
 
@@ -19,13 +20,11 @@ from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import SetParameters
 from ros_bench import DEADLINE_S, start_process, until
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import String
 
 from sfa_localization.nodes.entry import CANNOT_START, DIED
-from sfa_localization.nodes.lifecycle import latched_qos
 
 pytestmark = pytest.mark.ros
-RUN = 'import sys; from sfa_localization.nodes import entry; sys.exit(entry.{}())'
+IMPORT = 'import sys; from sfa_localization.nodes import entry'
 
 
 @pytest.fixture
@@ -35,9 +34,9 @@ def start():
 
     def begin(node, *arguments, before=''):
         """What its executable runs, after other code."""
-        words = ['--ros-args', *arguments] if arguments else []
-        code = f'{before}\n{RUN.format(node)}'
-        process = start_process('-c', code, *words, stderr=subprocess.PIPE, text=True)
+        code = f'{before}\n{IMPORT}; sys.exit(entry.{node}())'
+        words = '-c', code, '--ros-args', *arguments
+        process = start_process(*words, stderr=subprocess.PIPE, text=True)
         processes.append(process)
         return process
 
@@ -52,18 +51,6 @@ def ended(process):
     """Wait until a process ends, perhaps beside others: its exit code, and what it printed."""
     _, text = process.communicate(timeout=3 * DEADLINE_S)
     return process.returncode, text
-
-
-def test_a_signal_ends_the_node_with_exit_code_0(bench, start):
-    """Active by SIGINT, unconfigured by SIGTERM."""
-    heard, active = [], start('ekf_node')
-    unconfigured = start('ekf_node', '-p', 'autostart:=false', '-r', '__node:=other')
-    bench.node.create_subscription(String, 'ekf/state', heard.append, latched_qos())
-    assert until(lambda: heard and 'other' in bench.node.get_node_names())
-    for process, number in ((active, signal.SIGINT), (unconfigured, signal.SIGTERM)):
-        process.send_signal(number)
-        code, text = ended(process)
-        assert code == 0 and 'Traceback' not in text, text
 
 
 def test_what_rclpy_cannot_handle_itself_ends_nothing(bench, start):
@@ -147,18 +134,22 @@ WRONG = [
     ('ekf_node', ['--params-file', 'keyless.yaml'], 'before ros__parameters at line 2'),
     ('ekf_node', ['--lost_std', '2'], "ROS cannot use its arguments: ['--lost_std', '2']"),
 ]
+IN_TURN = """
+for words in {!r}:
+    sys.stderr.write(f'\\n== {{entry.run(words[0], words)}}\\n')
+"""
 
 
-def test_a_wrong_parameter_ends_the_node_with_its_name(start, tmp_path):
+def test_a_wrong_parameter_ends_the_node_with_its_name(start, tmp_path, monkeypatch):
     """And a file or argument that ROS cannot read with the reason."""
+    monkeypatch.chdir(tmp_path)
     (tmp_path / 'keyless.yaml').write_text('ekf_node:\n  speed_std: 1.0\n')
-    started = []
-    for node, words, why in WRONG:
-        words = [f'{tmp_path}/{word}' if word.endswith('.yaml') else word for word in words]
-        started.append((start(node, *words), why))
-    for process, why in started:
-        code, text = ended(process)
-        assert code == CANNOT_START and why in text and 'Traceback' not in text, (why, text)
+    before = IMPORT + IN_TURN.format([[node, '--ros-args', *words] for node, words, _ in WRONG])
+    _, text = ended(start('ekf_node', '--help', before=before))
+    outputs = re.split(r'\n== (\d)\n', text)
+    assert outputs[1::2] == [str(CANNOT_START)] * len(WRONG) and 'Traceback' not in text, text
+    for (_, _, why), output in zip(WRONG, outputs[::2], strict=False):
+        assert why in output, text
 
 
 def test_a_node_that_dies_later_has_another_exit_code_than_one_that_cannot_start(start):

@@ -5,9 +5,7 @@
 import array
 import dataclasses
 import math
-from dataclasses import dataclass
 
-import numpy as np
 import pytest
 
 from sfa_localization.camera.settings import PanoramaConfig
@@ -30,7 +28,7 @@ from sfa_localization.nodes.lifecycle import LocalizationNode, sensor_qos
 pytestmark = pytest.mark.ros
 
 
-@dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class Knobs(Settings):
     gain: float = setting(0.5, 'a gain', unit='m', low=0.0, high=2.0, live=True)
     offset: float = setting(0.0, 'unbounded', live=True)
@@ -81,16 +79,15 @@ def test_a_wrong_parameter_is_rejected_at_start_by_name(knobs):
 def test_a_wrong_live_change_is_rejected_and_changes_nothing(knobs):
     """Changes are checked together, and integers serve."""
     node = knobs()
-    for name, value in (
-        ('fixed', 2.0), ('offset', math.nan), ('mode', 'c'), ('gain', 'x'), ('count', 2.0),
-    ):  # fmt: skip
+    wrong = {'fixed': 2.0, 'offset': math.nan, 'mode': 'c', 'gain': 'x', 'count': 2.0}
+    for name, value in wrong.items():
         assert not node.set_parameters([Parameter(name, value=value)])[0].successful
-        assert node.settings(Knobs) == Knobs()
+    assert node.settings(Knobs) == Knobs()
     assert node.set_parameters([Parameter('gain', value=2)])[0].successful
     assert node.get_parameter('gain').type_ is Parameter.Type.DOUBLE
     refused = node.set_parameters([Parameter('count', value=1)])[0]
     assert not refused.successful and 'gain must not exceed count' in refused.reason
-    assert node.settings(Knobs).count == 3 and node.get_parameter('count').value == 3
+    assert node.settings(Knobs).count == node.get_parameter('count').value == 3
     both = [Parameter('count', value=1), Parameter('gain', value=0.5)]
     assert node.set_parameters_atomically(both).successful
     assert node.settings(Knobs) == Knobs(gain=0.5, count=1)
@@ -100,14 +97,12 @@ def test_a_list_has_real_numbers_also_while_it_is_empty(knobs):
     """Also once it was set as `ros2 param set` does it: an empty list of booleans."""
     doubles = ParameterType.PARAMETER_DOUBLE_ARRAY
     for node in (knobs(), knobs(path=[1.0]), knobs(path=None)):
-        for value in ([], [3], [], array.array('d', [3.5]), []):
+        for value in ([], [3], [], array.array('d', [3.5])):
             kind = Parameter.Type.BOOL_ARRAY if value == [] else None
             assert node.set_parameters([Parameter('path', kind, value)])[0].successful
             assert node.settings(Knobs).path == tuple(value)
             told = node.get_parameter('path').get_parameter_value()
             assert told.type == node.describe_parameter('path').type == doubles
-            assert list(told.double_array_value) == list(value)
-    assert node.describe_parameter('corner').type == doubles
 
 
 class Echo(LocalizationNode):
@@ -150,17 +145,13 @@ def test_what_fails_in_callbacks_timers_health_and_services_is_counted_and_ends_
     monitor = node.monitors['in']
     assert (monitor.received, monitor.used) == (3, 1)
     assert monitor.refused == {'negative': 1, 'internal error: ZeroDivisionError': 1}
-    assert math.isfinite(monitor.silent_for_s()) and float(monitor.values()['rate [Hz]']) > 0
-    assert node.monitors['timer tick'].refused == {
-        'not ready': 1, 'internal error: ZeroDivisionError': 1,
-    }  # fmt: skip
+    assert node.monitors['timer tick'].refused.keys() >= {'not ready'}
     assert until(lambda: told and 'running' in told[-1].status[0].message)
     keys = {value.key for value in told[-1].status[0].values}
     for timer in ('tick', 'publish_health'):
         assert f'timer {timer}: refused: internal error: ZeroDivisionError' in keys
-    for _ in range(2):
-        answer = bench.call(Trigger, 'echo/fail', Trigger.Request())
-        assert not answer.success and answer.message == 'no model; give one'
+    answer = bench.call(Trigger, 'echo/fail', Trigger.Request())
+    assert not answer.success and answer.message == 'no model; give one'
 
 
 def test_a_node_starts_itself_unless_told_not_to_and_survives_its_life_cycle_twice(bench):
@@ -177,35 +168,21 @@ def test_a_node_starts_itself_unless_told_not_to_and_survives_its_life_cycle_twi
     assert not node.active
 
 
-# Conversions.
-
-
-def test_messages_survive_the_round_trip():
+def test_stamps_yaws_and_panoramas_survive_the_round_trip():
+    """Poses and odometry do in test_ekf_node.py."""
     for stamp_ns in (1, 999_999_999, 1_000_000_000, 1_700_000_000_123_456_789):
         assert read_stamp(convert.to_stamp(stamp_ns)) == stamp_ns
-        for yaw in (0.0, 1.0, -3.0, math.pi, -math.pi + 1e-9):
-            back = read_yaw(convert.to_quaternion(yaw))
-            assert abs(math.remainder(back - yaw, 2 * math.pi)) < 1e-12
-            read_ns, read = convert.read_turned(convert.to_turned(yaw, stamp_ns, 'map'))
-            assert read_ns == stamp_ns and abs(math.remainder(read - yaw, 2 * math.pi)) < 1e-9
-    covariance = np.array([[0.2, 0.05, 0.01], [0.05, 0.3, 0.02], [0.01, 0.02, 0.1]])
-    message = convert.to_pose_with_covariance([1.0, -2.0, 3.0], covariance, 7, 'map')
-    stamp_ns, pose, back = convert.read_pose(message)
-    assert stamp_ns == 7 and message.header.frame_id == 'map'
-    assert np.allclose(pose, [1, -2, 3]) and np.allclose(back, covariance)
-    twist, frames = ([0.5, -0.2], np.diag([4e-4, 1e-4])), ('odom', 'base_link')
-    message = convert.to_odometry([1, 2, 3], covariance, *twist, 5, frames)
-    assert (message.header.frame_id, message.child_frame_id) == frames
-    stamp_ns, motion, pose = convert.read_odometry(message)
-    assert (stamp_ns, *motion) == (5, 0.5, -0.2, 4e-4, 1e-4) and np.allclose(pose, [1, 2, 3])
+    for yaw in (0.0, 1.0, -3.0, math.pi, -math.pi + 1e-9):
+        assert abs(math.remainder(read_yaw(convert.to_quaternion(yaw)) - yaw, math.tau)) < 1e-12
     panorama = PanoramaConfig(width=300, elevation_min=-7.25, clockwise=False)
     assert convert.read_info(convert.to_info(panorama)) == panorama
-
-
-def test_nothing_that_is_not_finite_gets_out():
-    with pytest.raises(MessageError, match='output'):
-        convert.to_pose([math.nan, 0.0, 0.0], 1, 'map')
-    assert convert.to_pose([1.0, 2.0, math.nan], 1, 'map').pose.orientation.w == 1.0
     for text in ('', '[1]', '{"width": "wide"}', '{"colour": 1}', f'{{"width": {10**400}}}'):
         with pytest.raises(MessageError):
             convert.read_info(String(data=text))
+
+
+def test_nothing_that_is_not_finite_gets_out():
+    for pose in ([math.nan, 0.0, 0.0], [0.0, math.inf, 0.0]):
+        with pytest.raises(MessageError, match='output'):
+            convert.to_pose(pose, 1, 'map')
+    assert convert.to_pose([1.0, 2.0, math.nan], 1, 'map').pose.orientation.w == 1.0

@@ -3,15 +3,15 @@
 """Errors of wheels that images show: in turns, by loop closures, and of the way lost in turns."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
-from cylinder_worlds import Spheres, place, recipe, run_in, wander
+from cylinder_worlds import SMALL_RECIPE, Spheres, recipe, run_in, wander
 from metric_worlds import drive, meander
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import align, wrap_angle
+from sfa_localization.data.rig import Rig
 from sfa_localization.data.run import Odometry, integrate
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack, Way
@@ -23,9 +23,9 @@ from sfa_localization.metric.odometry_errors import (
     corrections,
     way_of,
 )
-from sfa_localization.metric.segments import cut_track
 from sfa_localization.metric.settings import SegmentConfig
 from sfa_localization.reports.summary import summary
+from sfa_localization.sfa.network_training import ImageSequence, train_network
 from sfa_localization.training import learn_place
 from sfa_localization.training_input import TrainingInput
 
@@ -63,21 +63,25 @@ def drives(yaw_noise: float):
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 def test_images_that_turn_better_correct_the_odometry(sign):
+    """By closures, one of ten of which is wrong."""
     runs = drives(0.04)
-    yaws, noise = corrections(headings_of(runs, 0.004, sign), closures_of(runs, 200))
+    closures = closures_of(runs, 200)
+    wrong = closures.turn + 1.5 * (np.arange(400) % 10 == 0)
+    closures = dataclasses.replace(closures, turn=wrong)
+    yaws, noise = corrections(headings_of(runs, 0.004, sign), closures)
     assert 0.002 < noise < 0.006
     for run, yaw in zip(runs, yaws, strict=True):
         before = OdometryTrack.of(run.odometry, CONFIG)
         after = before.corrected(run.stamps_ns, yaw, noise)
         at = np.searchsorted(after.stamps_ns, run.stamps_ns)
-        before_error, after_error = (
+        (turned, missed), (turned_before, missed_before) = (
             (
                 np.std(track.yaw[at] - np.unwrap(run.poses[:, 2])),
                 np.hypot(*(track.poses[at, :2] - run.poses[:, :2]).T).mean(),
             )
-            for track in (before, after)
+            for track in (after, before)
         )
-        assert after_error[0] < 0.25 * before_error[0] and after_error[1] < 0.5 * before_error[1]
+        assert turned < 0.25 * turned_before and missed < 0.5 * missed_before
 
 
 def test_nothing_is_corrected_without_evidence_that_images_turn_better():
@@ -91,46 +95,11 @@ def test_nothing_is_corrected_without_evidence_that_images_turn_better():
         assert corrections(headings_of(bad, 0.004), closures) is None
 
 
-def test_a_few_wrong_closures_change_little():
-    runs = drives(0.04)
-    closures = closures_of(runs, 200)
-    wrong = closures.turn + 1.5 * (np.arange(400) % 10 == 0)
-    first, second = (
-        corrections(headings_of(runs, 0.004), dataclasses.replace(closures, turn=turn))[0][0]
-        for turn in (closures.turn, wrong)
-    )
-    np.testing.assert_allclose(second, first, atol=0.02 * np.ptp(first))
-
-
-def test_segments_have_the_corrected_turns_and_their_noise():
-    run, _ = drives(0.04)
-    yaw = np.unwrap(run.poses[:, 2])
-    track = OdometryTrack.of(run.odometry, CONFIG)
-    at = np.searchsorted(track.stamps_ns, run.stamps_ns)
-    exact = track.corrected(run.stamps_ns, yaw - track.yaw[at], 0.002)
-    segments = cut_track(exact, run.stamps_ns, CONFIG)
-    for a, b in itertools.pairwise(segments.items):
-        assert abs(wrap_angle(a.turn_rad - (yaw[b.images[0]] - yaw[a.images[0]]))) < 1e-6
-        assert a.turn_variance >= 0.002**2 * a.turn_time_s * 0.99
-
-
-def test_segments_of_corrected_turns_are_longer_and_their_links_stronger():
-    run, _ = drives(0.0)
-    track = OdometryTrack.of(run.odometry, CONFIG)
-    same = track.corrected(run.stamps_ns, 0.0 * run.stamps_ns, CONFIG.yaw_noise)
-    before, after = (cut_track(each, run.stamps_ns, CONFIG) for each in (track, same))
-    weak, strong = (
-        np.median([s.displacement_variance / s.turn_time_s for s in part if s.linked])
-        for part in (before, after)
-    )
-    assert len(after) < len(before) and strong < weak
-
-
 def test_a_training_turns_by_its_images_where_wheels_slip():
     """Columns grow counterclockwise; up to the segments, with and without loop closures."""
     panorama = PanoramaConfig(width=120, height=24, clockwise=False)
     config = dataclasses.replace(recipe(False), panorama=panorama)
-    true = wander(600, 2, hz=4.0)
+    true = wander(400, 2, hz=4.0)
     run = run_in(Spheres.about(1), true, panorama)
     twists = true.twists.copy()
     twists[:, 1] += 0.1 * np.random.default_rng(0).standard_normal(len(twists))
@@ -167,9 +136,9 @@ def way(loss, before=None, map_scale=1.0, seconds=300.0, v=0.3):
     return way_of(track, stamps[::4], poses, before)
 
 
-@pytest.mark.parametrize('v', [0.3, -0.3])
-def test_images_show_the_loss_forward_and_backward(v):
-    for loss in (0.08, 0.15, 0.25, -0.1):
+@pytest.mark.parametrize('loss', [0.08, 0.25, -0.1])
+def test_images_show_the_loss_forward_and_backward(loss):
+    for v in (0.3, -0.3):
         assert way(np.sign(v) * loss, v=v)[:2] == pytest.approx((1.0, loss), abs=0.02)
 
 
@@ -191,14 +160,13 @@ def test_where_images_show_no_loss_nothing_is_corrected():
 @pytest.mark.slow
 def test_wheels_that_lose_way_in_turns_give_nearly_as_good_a_map():
     """With the loss uncorrected the map errs by 0.030 m."""
-    config, true = recipe(), wander(400, 2, hz=4.0)
-    run = run_in(Spheres.about(1), true, config.panorama)
+    true, panorama = wander(400, 2, hz=4.0), SMALL_RECIPE.panorama
+    run = run_in(Spheres.about(1), true, panorama)
+    network = train_network(SMALL_RECIPE.architecture, [ImageSequence.of(run)])
     run = dataclasses.replace(run, odometry=losing(true, 0.15))
-    exact = place()
-    trained = learn_place(exact.model.network, [run], config)
+    trained = learn_place(network, [run], SMALL_RECIPE)
     loss = trained.model.rig.turn_loss
-    assert exact.model.rig.turn_loss.value == 0.0
-    assert loss.value == pytest.approx(0.15, abs=0.06) and loss.std < exact.model.rig.turn_loss.std
+    assert loss.value == pytest.approx(0.15, abs=0.06) and loss.std < Rig().turn_loss.std
     assert 'm per radian in turns: taken into account' in summary(trained)
     images = run.panoramas.read(0, len(run.panoramas))
     places = np.array([each.position for each in trained.model.locate_all(images)])
@@ -206,4 +174,4 @@ def test_wheels_that_lose_way_in_turns_give_nearly_as_good_a_map():
     placed, center = align(places, truth).apply(places), truth.mean(0)
     # Odometry that loses way does not show the scale.
     placed = center + (placed - center) * (truth - center).std() / (placed - center).std()
-    assert np.hypot(*(placed - truth).T).mean() < 0.025
+    assert np.hypot(*(placed - truth).T).mean() < 0.02

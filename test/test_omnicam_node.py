@@ -3,31 +3,23 @@
 """The omnicam node on real messages: panoramas, demand, bad pictures, live parameters, sources."""
 
 import dataclasses
-import threading
 
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 from sfa_localization.camera import watch
 from sfa_localization.camera.calibration_files import calibration_text
 from sfa_localization.camera.encodings import decode_compressed
 from sfa_localization.camera.leveling import leveled
 from sfa_localization.camera.panorama import Unwrapper
-from sfa_localization.camera.settings import (
-    CameraConfig,
-    CaptureConfig,
-    LensCalibration,
-    PanoramaConfig,
-)
-from sfa_localization.config import load_settings, write_config
+from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Quaternion
-from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from ros_bench import until
 from sensor_msgs.msg import CompressedImage, Image, Imu
@@ -42,13 +34,11 @@ from sfa_localization.nodes.conversions import (
 )
 from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.nodes.omnicam_node import OmnicamNode
-from sfa_localization.nodes.settings import OmnicamNodeConfig
 
 pytestmark = pytest.mark.ros
 PANORAMA = PanoramaConfig(width=120, height=12)
 SMALL = {'width': 120, 'height': 12, 'camera_model': 'mirror'}
 MIRROR = CameraConfig(camera_model='mirror')
-GROUPS = (OmnicamNodeConfig, CaptureConfig, CameraConfig, PanoramaConfig)
 STAMP_NS = 12_000_000_034
 
 
@@ -121,18 +111,14 @@ def test_panoramas_are_leveled_by_an_imu(bench):
 
 
 def test_compressed_pictures_in_and_out(bench):
-    node = bench.run(OmnicamNode, image_transport='compressed', **SMALL)
-    heard, topic = bench.listen(CompressedImage, 'panorama/compressed'), 'image_raw/compressed'
+    bench.run(OmnicamNode, image_transport='compressed', **SMALL)
+    heard = bench.listen(CompressedImage, 'panorama/compressed')
     sent = to_compressed(raw_picture(), STAMP_NS, 'camera', 95)
-    told = answer(bench, heard, sent, topic)
+    told = answer(bench, heard, sent, 'image_raw/compressed')
     assert told.header.stamp.sec == 12
     expected = Unwrapper(MIRROR, PANORAMA)(pixels(sent))
     decoded = decode_compressed(told.data.tobytes())
     assert np.corrcoef(decoded.ravel(), expected.ravel())[0, 1] > 0.6
-    refused = node.monitors[topic].refused
-    broken = CompressedImage(header=sent.header, format='jpeg', data=b'no picture')
-    assert bench.publish_until(topic, broken, lambda: refused)
-    answer(bench, heard, sent, topic)
 
 
 def test_nobody_listens_nothing_is_done(bench):
@@ -143,7 +129,7 @@ def test_nobody_listens_nothing_is_done(bench):
     for _ in range(2):
         listener = bench.node.create_subscription(Image, 'panorama', lambda _: None, 1)
         assert until(lambda: node.count_subscribers('image_raw') == 1)
-        bench.node.destroy_subscription(listener)
+        bench.do(bench.node.destroy_subscription, listener)
         assert until(lambda: node.count_subscribers('image_raw') == 0)
 
 
@@ -151,17 +137,16 @@ def test_it_outlives_every_bad_image_and_counts_each(bench):
     """What is wrong with images is tested in test_pictures.py."""
     node, heard = start(bench)
     told, monitor = bench.listen(DiagnosticArray, '/diagnostics'), node.monitors['image_raw']
-    answer(bench, heard, message())
-    empty, stampless, count = message(), message(stamp_ns=0), len(heard)
+    empty = message()
     empty.height = 0
-    for kinds, bad in enumerate([empty, to_image(raw_picture()[:480], 1, 'camera'), stampless], 1):
+    cropped = to_image(raw_picture()[:480], 1, 'camera')
+    answer(bench, heard, message())
+    for kinds, bad in enumerate([empty, cropped, message(stamp_ns=0)], 1):
         assert bench.publish_until('image_raw', bad, lambda n=kinds: len(monitor.refused) == n)
     assert not any('internal' in why for why in monitor.refused)
     answer(bench, heard, message())
-    assert len(heard) - count < 5
-    assert until(lambda: '/image_raw: refused: empty image' in {
-        pair.key for pair in told[-1].status[0].values
-    })  # fmt: skip
+    key = '/image_raw: refused: empty image'
+    assert until(lambda: key in {pair.key for pair in told[-1].status[0].values})
 
 
 def changed(node, **values):
@@ -191,7 +176,6 @@ def test_impossible_cameras_do_not_start_and_impossible_changes_are_rejected(ben
     """Nor one that would hear itself."""
     loop = {'options': with_rules('image_raw:=panorama')}
     for parameters, words in (
-        ({'source': 'video'}, 'source_path'),
         ({'calibration_file': 'nowhere.yaml'}, 'nowhere.yaml'),
         ({'elevation_min': 60.0, 'elevation_max': 80.0}, 'sees no part'),
         (loop, 'which this node itself publishes: remap'),
@@ -205,7 +189,6 @@ def test_impossible_cameras_do_not_start_and_impossible_changes_are_rejected(ben
         ({'elevation_max': -40.0}, 'elevation_min'),
         ({'mask_file': 'nowhere.png'}, 'nowhere.png'),
         ({'blind_sectors': [10.0]}, 'a start and an end'),
-        ({'mount_rpy': [1.0, 2.0]}, 'roll, pitch and yaw'),
     ):
         result = changed(node, **change)
         assert not result.successful and words in result.reason
@@ -223,26 +206,6 @@ def test_a_remap_of_the_base_topic_holds_for_its_transports(bench, rules, heard)
     assert until(lambda: bench.node.count_subscribers(heard) == 1)
 
 
-def dumped(node):
-    """What `ros2 param dump` writes."""
-    given = node.get_parameters(node.list_parameters([], 0).names)
-    return {each.name: parameter_value_to_python(each.get_parameter_value()) for each in given}
-
-
-def test_what_ros2_param_dump_writes_can_be_loaded_again(bench, tmp_path):
-    path = tmp_path / 'omnicam_node.yaml'
-    write_config(path, {'omnicam_node': {'source_rate': 7.5}})
-    options = {'cli_args': ['--ros-args', '--params-file', str(path)]}
-    node = bench.run(OmnicamNode, start=False, options=options)
-    first, settings = dumped(node), [node.settings(kind) for kind in GROUPS]
-    assert first['blind_sectors'] == [] and first['source_rate'] == 7.5
-    bench.end(node)
-    path.write_text(yaml.safe_dump({'/omnicam_node': {'ros__parameters': first}}))
-    node = bench.run(OmnicamNode, start=False, options=options)
-    assert [node.settings(kind) for kind in GROUPS] == settings and dumped(node) == first
-    assert [load_settings(path, 'omnicam_node', kind) for kind in GROUPS] == settings
-
-
 def test_a_silent_camera_shows_in_diagnostics(bench, monkeypatch):
     """And one that is frozen, or masked."""
     monkeypatch.setattr(watch, 'FROZEN_S', 0.2)
@@ -258,10 +221,12 @@ def test_a_silent_camera_shows_in_diagnostics(bench, monkeypatch):
     assert bench.publish_until('image_raw', message(), lambda: 'repeated' in node.health()[1])
 
 
-def test_a_folder_of_pictures(bench, tmp_path):
-    for number in range(3):
-        cv2.imwrite(str(tmp_path / f'{number}.png'), raw_picture(number))
-    (tmp_path / '3.png').write_bytes(b'no picture')
+def test_a_folder_of_pictures_in_order_of_their_names(bench, tmp_path):
+    """What cannot be read is counted, and other files are ignored."""
+    for name, seed in (('b.png', 1), ('a.png', 0), ('d.bmp', 2)):
+        cv2.imwrite(str(tmp_path / name), raw_picture(seed))
+    (tmp_path / 'c.png').write_bytes(b'no picture')
+    (tmp_path / 'notes.txt').write_text('ignored')
     heard = []
     bench.node.create_subscription(Image, 'panorama', heard.append, QoSProfile(depth=10))
     node = bench.run(
@@ -274,20 +239,5 @@ def test_a_folder_of_pictures(bench, tmp_path):
         assert told.header.frame_id == 'omnicam'
     stamps = [read_image(told)[0] for told in heard]
     assert stamps == sorted(stamps) and stamps[0] > 10**18
-    assert until(lambda: sum(node.monitors[str(tmp_path)].refused.values()) == 1)
-
-
-def test_of_images_that_come_too_fast_the_newest_is_used(bench):
-    """A burst while the node is busy: no more than the depth of one waits for it."""
-    _, heard = start(bench)
-    answer(bench, heard, message())
-    busy, go_on = threading.Event(), threading.Event()
-    bench.executor.create_task(lambda: (busy.set(), go_on.wait(60)))
-    assert busy.wait(60)
-    heard.clear()
-    for second in range(100, 120):
-        bench.publish('image_raw', message(stamp_ns=second * 10**9))
-    assert not until(lambda: heard, 1.0), 'the burst only has to be over'
-    go_on.set()
-    assert until(lambda: any(told.header.stamp.sec == 119 for told in heard))
-    assert len([told for told in heard if told.header.stamp.sec >= 100]) <= 2
+    (reason,) = node.monitors[str(tmp_path)].refused
+    assert 'c.png' in reason

@@ -29,6 +29,12 @@ TWINS = {
     'feeding a filter': (
         r'\.add_measurement\(', {'fusion/replay.py', 'localizer.py', 'nodes/ekf_node.py'},
     ),
+    'writing a file, whole or not at all': (
+        r"\.write_(text|bytes)\(|imwrite\(|savetxt\(|mk[ds]temp\(|\.rename\(|NamedTemporaryFile\(|"
+        r"fdopen\(|open\([^)]*'[wxa]b?'",
+        # A folder that is renamed when whole; temporary folders; standard output.
+        {'data/files.py', 'bags/writer.py', 'bags/files.py', 'commands/live_nodes.py', 'cli.py'},
+    ),
     'a filter for a model': (
         r'(fused|filter)\.expect\(', {'localizer.py', 'nodes/ekf_node.py'},
     ),

@@ -82,33 +82,34 @@ def imports(module: str) -> frozenset[str]:
     """Return the full names a module imports, anywhere in it, but not for type checkers only."""
     names: set[str] = set()
     skipped: set[ast.AST] = set()
-    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding='utf-8'))):
+    for node in ast.walk(tree(module)):
         if isinstance(node, ast.If) and 'TYPE_CHECKING' in ast.unparse(node.test):
             skipped.update(inner for line in node.body for inner in ast.walk(line))
-        if node in skipped:
-            continue
-        if isinstance(node, ast.Import):
+        elif isinstance(node, ast.Import) and node not in skipped:
             names.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
+        elif isinstance(node, ast.ImportFrom) and node not in skipped:
             assert node.level == 0, f'{module}: relative import'
             names.update(f'{node.module}.{alias.name}' for alias in node.names)
     return frozenset(names)
 
 
+@cache
+def tree(module: str) -> ast.AST:
+    return ast.parse(MODULES[module].read_text(encoding='utf-8'))
+
+
 def internal(module: str) -> set[str]:
     """Return the modules of this package that a module imports."""
-    return {module_of(name) for name in imports(module) if name.split('.')[0] == NAME}
-
-
-def module_of(name: str) -> str:
-    """Return the module that holds a dotted name of this package."""
-    return max((module for module in MODULES if f'{name}.'.startswith(f'{module}.')), key=len)
+    return {
+        max((m for m in MODULES if f'{name}.'.startswith(f'{m}.')), key=len)
+        for name in imports(module)
+        if name.split('.')[0] == NAME
+    }
 
 
 def external(module: str) -> set[str]:
     """Return the top-level packages, neither this nor standard, that a module imports."""
-    tops = {name.split('.')[0] for name in imports(module)}
-    return tops - {NAME} - set(sys.stdlib_module_names)
+    return {name.split('.')[0] for name in imports(module)} - {NAME} - set(sys.stdlib_module_names)
 
 
 def reached(start: str) -> set[str]:
@@ -128,15 +129,14 @@ def room(module: str) -> str:
 
 def wrong_imports(module: str) -> set[str]:
     """Return the modules and packages that a module imports, but its room may not."""
-    rooms, packages = ROOMS[room(module)]
-    wrong = external(module) - packages
-    for target in internal(module):
-        if (room(module), room(target)) in SETTINGS_ONLY:
-            allowed = target.endswith('.settings')
-        else:
-            allowed = room(target) in rooms | {room(module)}
-        wrong |= set() if allowed else {target}
-    return wrong
+    here, (rooms, packages) = room(module), ROOMS[room(module)]
+    wrong = {
+        target
+        for target in internal(module)
+        if room(target) not in rooms | {here}
+        or ((here, room(target)) in SETTINGS_ONLY and not target.endswith('.settings'))
+    }
+    return wrong | external(module) - packages
 
 
 def test_modules_import_only_what_their_rooms_may():
@@ -158,8 +158,8 @@ LONGEST_FUNCTION, TYPICAL_FUNCTION = 40, 8
 def test_functions_are_short():
     lengths = {
         f'{module}:{node.lineno} {node.name}': node.end_lineno - node.lineno + 1
-        for module, path in MODULES.items()
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        for module in MODULES
+        for node in ast.walk(tree(module))
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
     }
     assert {name: n for name, n in lengths.items() if n > LONGEST_FUNCTION} == {}
@@ -205,28 +205,21 @@ def test_pip_installs_a_command_and_the_nodes_and_colcon_all_commands():
         assert not [name for name in arguments['packages'] if 'test' in name or 'study' in name]
 
 
-@pytest.mark.parametrize(
-    ('module', 'unwanted'),
-    [
-        ('fusion.pose_filter', {'cv2', 'mdp', 'rosbags'}),
-        ('camera.panorama', {'scipy', 'filterpy', 'mdp', 'matplotlib'}),
-        ('localizer', {'mdp', 'trimesh', 'rosbags', f'{NAME}.training'}),
-    ],
-)
-def test_nodes_import_neither_training_nor_what_only_it_needs(module, unwanted):
-    command = [sys.executable, '-c', f'import sys, {NAME}.{module}\nprint(*sys.modules)']
+MAIN = 'from sfa_localization import cli\ntry: cli.main({})\nexcept SystemExit: pass'
+
+
+@pytest.mark.parametrize(('code', 'unwanted'), [
+    ('import sfa_localization.fusion.pose_filter', {'cv2', 'mdp', 'rosbags'}),
+    ('import sfa_localization.camera.panorama', {'scipy', 'filterpy', 'mdp', 'matplotlib'}),
+    ('import sfa_localization.localizer', {'mdp', 'trimesh', 'rosbags', f'{NAME}.training'}),
+    (MAIN.format(['--help']), {'matplotlib', 'rclpy', 'numpy', 'cv2'}),
+    (MAIN.format(['inspect', 'bags/sample']), {'matplotlib', 'rclpy'}),
+])  # fmt: skip
+def test_only_what_is_needed_is_imported(code, unwanted):
+    command = [sys.executable, '-c', f'import sys\n{code}\nprint(*sys.modules)']
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert unwanted & set(done.stdout.split()) == set() and NAME in done.stdout
-
-
-def test_commands_import_only_what_they_need():
-    """The overview imports none of them; an inspection without a report imports no figures."""
-    code = 'import sys\nfrom sfa_localization import cli\ntry:\n    cli.main({})\nfinally:\n'
-    code += '    print([name for name in ("matplotlib", "rclpy", {}) if name in sys.modules])'
-    for words, others in ((['--help'], '"numpy", "cv2"'), (['inspect', 'bags/sample'], '')):
-        command = [sys.executable, '-c', code.format(words, others)]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-        assert done.stdout.splitlines()[-1] == '[]', done.stderr
+    modules = set(done.stdout.splitlines()[-1].split())
+    assert NAME in modules and unwanted & modules == set(), done.stderr
 
 
 def test_an_executable_runs_the_command_it_is_named_after(monkeypatch, capsys):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cylinder_worlds import COLUMN_STEP, PLACE_SIZE, place, visit
+from cylinder_worlds import place, visit
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from sfa_localization import evaluation, training, updating
@@ -25,7 +25,7 @@ from sfa_localization.place_model import FORMAT, VERSION, PlaceModel
 
 @pytest.fixture(scope='module')
 def model() -> PlaceModel:
-    return place().model
+    return place(True).model
 
 
 @pytest.fixture(scope='module')
@@ -72,7 +72,7 @@ def test_images_are_located(clockwise):
     error = np.array([e.pose for e in estimates]) - truth
     assert np.median(np.hypot(*error[:, :2].T)) < 0.3
     assert np.degrees(np.median(np.abs(wrap_angle(error[:, 2])))) < 3
-    for image, together in zip(images[::4], estimates[::4], strict=True):
+    for image, together in zip(images[::9], estimates[::9], strict=True):
         alone = place(clockwise).model.locate(image)
         # Float32 rounds their headings differently, and the position follows.
         assert np.allclose(alone.pose, together.pose, atol=1e-4)
@@ -80,21 +80,8 @@ def test_images_are_located(clockwise):
         assert alone.explained == pytest.approx(together.explained, rel=1e-4)
 
 
-@pytest.mark.parametrize('clockwise', [True, False])
-@pytest.mark.parametrize('steps', [1, -7])
-def test_rolled_columns_turn_the_robot(clockwise, steps):
-    """By k columns: 2 pi k / W of yaw, with the sign of the column direction, and no way."""
-    model, columns = place(clockwise).model, steps * COLUMN_STEP
-    # A robot that turned left sees everything farther right: at larger columns when clockwise.
-    turn = (1 if clockwise else -1) * 2 * np.pi * columns / PLACE_SIZE[1]
-    for picture in visit(clockwise).panoramas.read(0, 10):
-        plain, turned = model.locate(picture), model.locate(np.roll(picture, columns, axis=1))
-        assert abs(wrap_angle(turned.yaw - plain.yaw - turn)) < np.radians(2)
-        assert np.abs(turned.position - plain.position).max() < 0.1
-        assert turned.explained == pytest.approx(plain.explained, abs=0.01)
-
-
 def test_covariances_are_positive_definite(model, pictures):
+    pictures = pictures[::3]
     strange = np.random.default_rng(0).integers(0, 256, pictures.shape, np.uint8)
     for estimate in model.locate_all(np.concatenate([pictures, strange])):
         assert np.allclose(estimate.covariance, estimate.covariance.T)
@@ -115,24 +102,10 @@ def test_at_an_uncertain_heading_the_map_knows_little(model, pictures):
     assert uncertain > 10 * certain
 
 
-def test_symmetric_panoramas_raise_the_variance(model, pictures):
-    """Scenes that look alike in two directions, as corridors do, do not tell them."""
-    turned = np.roll(pictures, pictures.shape[2] // 2, axis=2)
-    symmetric = np.mean([pictures, turned], axis=0).round().astype(np.uint8)
-    usual, lost = (
-        np.array([e.covariance[2, 2] for e in model.locate_all(p)]) for p in (pictures, symmetric)
-    )
-    assert np.sqrt(usual.max()) < np.radians(1)
-    assert np.sqrt(lost.min()) > np.radians(30)
-
-
-def test_other_pictures_are_refused(model):
-    for shape, kind in (
-        ((12, 72), np.uint8), ((12, 72, 3), np.float32), ((12, 60, 3), np.uint8),
-        ((1, 12, 72, 3), np.uint8),
-    ):  # fmt: skip
+def test_other_pictures_are_refused(model, pictures):
+    for picture in (pictures[0, ..., 0], pictures[0] / 1.0, pictures[0, :, 12:], pictures[:1]):
         with pytest.raises(ModelError):
-            model.locate(np.zeros(shape, kind))
+            model.locate(picture)
 
 
 def test_a_model_is_the_same_after_it_was_saved(model, saved, pictures, tmp_path):
@@ -166,25 +139,23 @@ def test_what_is_no_model_is_refused_with_the_remedy(tmp_path):
 
 def test_a_damaged_model_is_refused_with_the_remedy(saved):
     whole, arrays = saved.read_bytes(), read_arrays(saved, FORMAT, VERSION, '')
-    for cut in (0.1, 0.99):
-        saved.write_bytes(whole[: int(len(whole) * cut)])
-        refused(saved, 'not a sfa_localization place model')
+    saved.write_bytes(whole[: int(len(whole) * 0.99)])
+    refused(saved, 'not a sfa_localization place model')
     for name in ('metric/linear', 'keyframes/values', 'turned/axes'):
         data = bytearray(whole)
         data[whole.index(arrays[name].tobytes()) + 9] ^= 16
         saved.write_bytes(data)
         refused(saved, 'damaged.*: copy it again, or train it')
-    for name in ('network/1/slow', 'metric/linear', 'keyframes/errors', 'turned/axes'):
-        saved.write_bytes(whole)
-        rewrite(saved, without=name)
-        refused(saved, 'train')
-    for header, told in (
+    for changes, told in (
+        ({'without': 'network/1/slow'}, 'train'),
+        ({'without': 'metric/linear'}, 'train'),
+        ({'without': 'keyframes/errors'}, 'train'),
         ({'format': 'something else'}, 'a something else, not a'),
         ({'version': VERSION + 1}, f'version {VERSION + 1}, this software reads {VERSION}: train'),
         ({'panorama': {'nonsense': 1}}, 'damaged.*train it again'),
     ):
         saved.write_bytes(whole)
-        rewrite(saved, **header)
+        rewrite(saved, **changes)
         refused(saved, told)
     np.savez(saved, **{**arrays, 'evil': np.array([object()], dtype=object)})
     refused(saved, 'not a sfa_localization place model')

@@ -7,18 +7,11 @@ import signal
 import subprocess
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bag_formats import (
-    COUNTS,
-    IMAGES,
-    image,
-    stamp,
-    write_database,
-    write_ros1,
-    write_rosbags,
-)
+from bag_formats import COUNTS, IMAGES, image, stamp, write_database, write_ros1, write_rosbags
 
 from sfa_localization.data.errors import BagError
 
@@ -27,25 +20,17 @@ pytest.importorskip('rclpy')
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from ros_bench import DEADLINE_S, DOMAIN, start_process, until
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags.interfaces import QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, Imu
 
 from sfa_localization.commands import bag_player
-from sfa_localization.commands.bag_player import SETTLED_S, message_class, play, qos_profile
+from sfa_localization.commands.bag_player import SETTLED_S, play, qos_profile
 from sfa_localization.commands.play import PlayConfig
 from sfa_localization.data.messages import read_stamp
 
 pytestmark = pytest.mark.ros
 FAST, HURRIED = PlayConfig(rate=20.0, wait=20.0), PlayConfig(rate=50.0, wait=0.0)
-NO_TIME = QosTime(9223372036, 854775807)
 TOPICS = {'/image_raw': Image, '/imu': Imu, '/odom': Odometry}
 
 
@@ -69,21 +54,19 @@ def hear(bench, monkeypatch):
     return subscribe
 
 
-def offered(reliability, durability, depth=5) -> Qos:
-    times = (NO_TIME, NO_TIME, QosLiveliness.AUTOMATIC, NO_TIME)
-    return Qos(QosHistory.KEEP_LAST, depth, reliability, durability, *times, False)
-
-
 def test_quality_of_service_suits_the_recorded():
+    def offered(reliable, latched, depth=5):
+        reliability = QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT
+        durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+        return SimpleNamespace(reliability=reliability, durability=durability, depth=depth)
+
     weak, reliable = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
     volatile, latched = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
-    plain = offered(QosReliability.BEST_EFFORT, QosDurability.VOLATILE)
-    strong = offered(QosReliability.RELIABLE, QosDurability.VOLATILE, 50)
-    lasting = offered(QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL)
+    plain, strong, lasting = offered(False, False), offered(True, False, 50), offered(True, True)
     for recorded, expected in (
         ([], (reliable, volatile, 10)), ([plain], (weak, volatile, 10)),
-        ([strong], (reliable, volatile, 50)), ([lasting], (reliable, latched, 100)),
-        ([plain, strong], (reliable, volatile, 50)), ([strong, lasting], (reliable, volatile, 50)),
+        ([lasting], (reliable, latched, 100)), ([plain, strong], (reliable, volatile, 50)),
+        ([strong, lasting], (reliable, volatile, 50)),
     ):  # fmt: skip
         profile = qos_profile(recorded)
         assert (profile.reliability, profile.durability, profile.depth) == expected
@@ -116,20 +99,16 @@ def test_clock_and_messages_keep_the_pace_of_the_recording(hear, path, messages,
 
 
 def test_topics_are_chosen_and_what_cannot_be_played_is_named(hear, path, tmp_path, messages):
-    """Before any wait for subscribers; types that are not installed are skipped."""
+    """Types that are not installed are skipped."""
     hear({})
     assert play(path, HURRIED, topics=['/imu']) == {'/imu': COUNTS['/imu']}
-    start = time.monotonic()
     with pytest.raises(BagError, match=r'has no topic /x; --topics can be: /ground_truth, /image'):
         play(path, FAST, topics=['/x'])
-    assert time.monotonic() - start < FAST.wait / 2
-    assert message_class('sensor_msgs/msg/Imu') is Imu
-    for kind in ('sensor_msgs/msg/Nothing', 'nowhere_msgs/msg/Imu', '', 'a b/msg/C'):
-        assert message_class(kind) is None
-    kinds = {'sensor_msgs/msg/Imu': 'nowhere_msgs/msg/Imu'}
-    write_database(tmp_path / 'a.db3', messages, kind=lambda name: kinds.get(name, name))
-    played = play(tmp_path / 'a.db3', HURRIED)
-    assert '/imu' not in played and played['/odom'] == COUNTS['/odom']
+    for other in ('nowhere_msgs/msg/Imu', 'sensor_msgs/msg/Nothing'):
+        kinds, file = {'sensor_msgs/msg/Imu': other}, tmp_path / other / 'a.db3'
+        write_database(file, messages, kind=lambda name, k=kinds: k.get(name, name))
+        played = play(file, HURRIED)
+        assert '/imu' not in played and played['/odom'] == COUNTS['/odom']
     write_database(tmp_path / 'b.db3', messages, kind=lambda name: 'nowhere_msgs/msg/Any')
     write_ros1(tmp_path / 'c.bag', messages)
     for name, why in {'b.db3': '/imu: type nowhere_msgs/msg/Any', 'c.bag': 'to ROS 2'}.items():
@@ -148,15 +127,14 @@ def test_a_late_subscriber_of_images_misses_none(hear, path):
     assert until(lambda: len(late) == IMAGES)
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_it_cleanly(number, hear, path):
+def test_a_signal_ends_it_cleanly(hear, path):
     """Also of a bag whose name is not UTF-8."""
     heard, odd = hear(TOPICS), path.rename(path.parent / os.fsdecode(b'\xff'))
     words = '-m', 'sfa_localization', 'play', odd, '--loop', '--rate=9'
     process = start_process(*words, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     try:
         assert until(lambda: len(heard['/imu']) > 1.5 * COUNTS['/imu'])
-        process.send_signal(number)
+        process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=DEADLINE_S)
     finally:
         process.kill()

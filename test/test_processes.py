@@ -5,6 +5,7 @@
 Stand-ins of the nodes fail in every way; the real ones run in test_readme_commands.py.
 """
 
+import itertools
 import os
 import signal
 import subprocess
@@ -18,10 +19,15 @@ import pytest
 from sfa_localization.data.errors import NodeError
 
 pytest.importorskip('rclpy')
-from ros_bench import DEADLINE_S, until
+from geometry_msgs.msg import PoseWithCovarianceStamped as Pose
+from nav_msgs.msg import Odometry
+from ros_bench import DEADLINE_S, FRAMES, SEEN, Bench, until
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
 
 from sfa_localization.commands import live_nodes
 from sfa_localization.commands.live_nodes import Processes
+from sfa_localization.nodes.conversions import to_odometry, to_pose_with_covariance
 
 pytestmark = pytest.mark.ros
 WAIT = 'import time; print("ready", flush=True); time.sleep(60)'
@@ -43,8 +49,8 @@ def children():
 @pytest.fixture(autouse=True)
 def no_process_remains(monkeypatch):
     """No process remains after a test; timeouts are short, and the environment is restored."""
-    for name, seconds in {'SETTLE_S': 0.3, 'STOP_S': 5.0}.items():
-        monkeypatch.setattr(live_nodes, name, seconds)
+    monkeypatch.setattr(live_nodes, 'SETTLE_S', 0.3)
+    monkeypatch.setattr(live_nodes, 'STOP_S', 2.0)
     with mock.patch.dict(os.environ):
         yield
     assert children() == []
@@ -58,24 +64,6 @@ def test_all_have_ended_afterwards_also_after_an_error(tmp_path):
         processes.require_alive(['obedient', 'stubborn'])
         assert len(children()) == 2
         raise ZeroDivisionError
-
-
-def test_a_dead_program_is_named_with_its_last_words(tmp_path):
-    code = 'import sys; [print("line", i) for i in range(9)]; sys.exit("no model")'
-    with Processes(tmp_path, 5.0) as processes:
-        processes.start('sfa_node', python(code))
-        with pytest.raises(NodeError) as caught:
-            until(lambda: processes.require_alive(['sfa_node']))
-        processes.start('player', python('print("done")'))
-        assert until(lambda: processes.ended('player'))
-        processes.start('killed', python(WAIT))
-        assert ready(processes, 'killed')
-        children()[-1].kill()
-        with pytest.raises(NodeError, match='SIGKILL'):
-            until(lambda: processes.ended('killed'))
-    text = str(caught.value)
-    assert 'sfa_node ended (exit code 1)' in text
-    assert 'line 8' in text and 'no model' in text and 'line 3' not in text
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
@@ -112,87 +100,63 @@ raise SystemExit(cli.main(['config']))
     assert not node.is_running()
 
 
-STAND_IN = """
-import math, sys, time
-role, behavior = sys.argv[1:3]
-if behavior == 'fail':
-    sys.exit('stand-in: no model, no bag')
-if role == 'play':
-    time.sleep(2.0)
-    sys.exit(0)
-import rclpy
-from geometry_msgs.msg import PoseWithCovarianceStamped as Pose
-from nav_msgs.msg import Odometry
-from rclpy.executors import ExternalShutdownException
-from sensor_msgs.msg import Image
-from std_msgs.msg import String
-
-rclpy.init()
-node = rclpy.create_node(role)
-SEEN = (Pose, 'sfa/pose_with_covariance')
-(kind, topic), wanted, listeners = {  # which are the next node, and the recorder
-    'omnicam_node': ((Image, 'panorama'), [], 1),
-    'sfa_node': (SEEN, [(Image, 'panorama')], 2),
-    'ekf_node': ((Odometry, 'ekf/odometry'), [(Odometry, '/odom'), SEEN], 1),
-}[role]
-publisher = node.create_publisher(kind, topic, 100)
-subscriptions = [node.create_subscription(*each, lambda m: None, 10) for each in wanted]
-states = node.create_publisher(String, 'ekf/state', 10)
-sent = 0
-
-def publish():
-    global sent
-    if role == 'ekf_node':
-        states.publish(String(data='LOCALISED'))
-    if publisher.get_subscription_count() < listeners or sent >= 60:
-        return
-    sent += 1
-    message = kind()
-    message.header.stamp.sec = sent
-    if kind is not Image:
-        message.pose.pose.position.x = float(sent)
-        message.pose.pose.orientation.z = math.sin(0.25)
-        message.pose.pose.orientation.w = math.cos(0.25)
-        message.pose.covariance[35] = math.pi ** 2 / 3 if role == 'sfa_node' else 0.1
-    if behavior == 'die' and sent == 3:
-        sys.exit(7)
-    publisher.publish(message)
-
-if behavior != 'silent':
-    node.create_timer(0.05, publish)
-try:
-    rclpy.spin(node)
-except (KeyboardInterrupt, ExternalShutdownException):
-    pass
-rclpy.try_shutdown()
-"""
+FIRST_NS = 10**9
 
 
-def programs(tmp_path, **behaviors):
-    script = tmp_path / 'stand_in.py'
-    script.write_text(STAND_IN)
-    roles = (*live_nodes.NODES, 'play')
-    return {name: [sys.executable, str(script), name, behaviors.get(name, '')] for name in roles}
+@pytest.fixture
+def robot():
+    """What the nodes subscribe to and publish, in the domain of `run_live`; a function that starts
+    to publish the poses and the state of these nodes.
+    """
+    bench = Bench(1 + os.getpid() % live_nodes.LARGEST_DOMAIN)
+    node, sent = bench.node, itertools.count(1)
+    for kind, topic in ((Odometry, 'odom'), (Image, 'panorama'), (Pose, SEEN)):
+        node.create_subscription(kind, topic, lambda _: None, 10)
+    topics = ((Pose, SEEN), (Odometry, 'ekf/odometry'), (String, 'ekf/state'))
+    sfa, ekf, states = (node.create_publisher(*topic, 100) for topic in topics)
+
+    def send(names):
+        number = next(sent)
+        pose, unknown = ([number, 0.0, 0.5], number * FIRST_NS), np.diag([0.1, 0.1, np.pi**2 / 3])
+        if 'sfa_node' in names:
+            sfa.publish(to_pose_with_covariance(pose[0], unknown, pose[1], 'map'))
+        if 'ekf_node' in names:
+            ekf.publish(to_odometry(pose[0], np.eye(3), [0, 0], np.eye(2), pose[1], FRAMES))
+            states.publish(String(data='LOCALISED'))
+
+    yield lambda *names: node.create_timer(0.05, lambda: send(names))
+    bench.close()
 
 
-def test_chain_records_what_the_nodes_publish(tmp_path):
-    """Until they publish no more after the replay."""
-    live = live_nodes.run_live(programs(tmp_path), tmp_path / 'logs')
+def run(tmp_path, **other):
+    """Run stand-ins of the programs, which wait, or play for a second, or do something else."""
+    codes = {**dict.fromkeys(live_nodes.NODES, WAIT), 'play': 'import time; time.sleep(1)', **other}
+    programs = {name: python(code) for name, code in codes.items()}
+    return live_nodes.run_live(programs, tmp_path / 'logs')
+
+
+def test_what_the_nodes_publish_is_recorded(tmp_path, robot):
+    robot('sfa_node', 'ekf_node')
+    live = run(tmp_path)
     assert live.state == 'LOCALISED'
     for trajectory in (live.sfa, live.ekf):
         assert len(trajectory) > 5 and np.all(np.diff(trajectory.stamps_ns) > 0)
-        seconds = trajectory.stamps_ns / 1e9
-        np.testing.assert_allclose(trajectory.poses[:, :2], np.stack([seconds, 0 * seconds], 1))
+        np.testing.assert_allclose(trajectory.poses[:, 0], trajectory.stamps_ns / FIRST_NS)
     np.testing.assert_allclose(live.ekf.poses[:, 2], 0.5)
     assert np.isnan(live.sfa.poses[:, 2]).all(), 'a heading of unknown variance is unknown'
 
 
-@pytest.mark.parametrize(('node', 'behavior', 'named'), [
-    ('sfa_node', 'fail', r'(?s)^sfa_node ended \(exit code 1\).*no model'),
-    ('sfa_node', 'silent', 'sfa_node is silent: nothing on sfa'),
-    ('ekf_node', 'die', r'ekf_node ended \(exit code 7\)'),
-    ('play', 'fail', r'(?s)play ended.*no bag'),
+LAST = 'import sys; [print("line", i) for i in range(9)]; sys.exit("no model")'
+
+
+@pytest.mark.parametrize(('node', 'code', 'named'), [
+    ('sfa_node', LAST, r'(?s)^sfa_node ended \(exit code 1\).*line 8.*no model'),
+    ('sfa_node', WAIT, 'sfa_node is silent: nothing on sfa'),
+    ('ekf_node', 'import os, time; time.sleep(1); os.kill(os.getpid(), 9)', 'ekf_node .*SIGKILL'),
+    ('play', 'raise SystemExit("no bag")', r'(?s)play ended.*no bag'),
 ])  # fmt: skip
-def test_a_program_that_fails_is_named(tmp_path, node, behavior, named):
-    with pytest.raises(NodeError, match=named):
-        live_nodes.run_live(programs(tmp_path, **{node: behavior}), tmp_path / 'logs')
+def test_a_program_that_fails_is_named_with_its_last_words(tmp_path, robot, node, code, named):
+    robot('ekf_node')
+    with pytest.raises(NodeError, match=named) as caught:
+        run(tmp_path, **{node: code})
+    assert 'line 3' not in str(caught.value)

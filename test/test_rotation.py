@@ -1,14 +1,15 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of the full rotation against brute force over explicitly rotated pictures."""
+"""Slow features: sums over the full rotation against brute force, and sources recovered."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sfa_localization.data.errors import DataError
 from sfa_localization.sfa.rotation import Field, FieldStatistics, SampleStatistics, unfold
-from sfa_localization.sfa.slowness import Statistics
+from sfa_localization.sfa.slowness import Statistics, solve
 
 FIELDS = (
     Field(2, 3, 1),
@@ -17,7 +18,7 @@ FIELDS = (
     Field(3, 8, 1),
     Field(1, 1, 1),
 )
-JOINED, BROKEN = np.ones(5, bool), np.array([True, False, True, False, True])
+BROKEN = np.array([True, False, True, False, True])
 
 
 def maps(seed: int, count: int, rows: int = 5, columns: int = 12, channels: int = 3) -> np.ndarray:
@@ -54,31 +55,14 @@ def brute_force(signals: np.ndarray, rotations: int, joined: np.ndarray) -> Stat
     difference = np.diff(per_node, axis=0) * weight[:, None, None]
     samples, steps = per_node.reshape(-1, d), difference.reshape(-1, d)
     counted = float((weight > 0).sum()) * per_node.shape[1]
-    sums = (samples.T @ samples, steps.T @ steps)
-    return Statistics(
-        len(samples) / rotations,
-        samples.sum(0) / rotations,
-        sums[0] / rotations,
-        counted / rotations,
-        sums[1] / rotations,
-    )
+    sums = len(samples), samples.sum(0), samples.T @ samples, counted, steps.T @ steps
+    return Statistics(*(each / rotations for each in sums))
 
 
 def assert_equal(ours: Statistics, theirs: Statistics, tolerance: float = 1e-5) -> None:
-    assert ours.weight == pytest.approx(theirs.weight, rel=1e-12)
-    assert ours.steps == pytest.approx(theirs.steps, rel=1e-12)
-    for name in ('total', 'second', 'difference'):
+    for name in ('weight', 'steps', 'total', 'second', 'difference'):
         a, b = getattr(ours, name), getattr(theirs, name)
-        assert np.abs(a - b).max() < tolerance * np.abs(b).max(), name
-
-
-def field_statistics(of, field, joined):
-    return fed(FieldStatistics(field, of.shape[2], field.rows * of.shape[3]), of, joined)
-
-
-def sample_statistics(of, joined):
-    signals = of.transpose(3, 0, 1, 2).copy()
-    return fed(SampleStatistics(of.shape[2], of.shape[-1]), signals, joined, axis=1)
+        assert np.abs(a - b).max() <= tolerance * np.abs(b).max(), name
 
 
 def fed(sums, of, joined, batch=1000, axis=0):
@@ -89,34 +73,30 @@ def fed(sums, of, joined, batch=1000, axis=0):
     return sums.result()
 
 
-@pytest.mark.parametrize('joined', [JOINED, BROKEN])
-def test_statistics_equal_brute_force(joined):
+def test_statistics_equal_brute_force():
     of = maps(1, 6)
-    turned = sequence(of)
-    for field in FIELDS:
-        explicit = views(turned, field)
-        assert_equal(field_statistics(of, field, joined), brute_force(explicit, 12, joined))
-        assert np.array_equal(unfold(of, field), views(of, field).astype(np.float32))
-    explicit = brute_force(turned.astype(np.float64), 12, joined)
-    assert_equal(sample_statistics(of, joined), explicit)
     single, none = of[:1], np.zeros(0, bool)  # it turns, but does not move
-    explicit = brute_force(views(sequence(single), FIELDS[0]), 12, none)
-    assert_equal(field_statistics(single, FIELDS[0], none), explicit)
-    assert_equal(sample_statistics(single, none), brute_force(sequence(single), 12, none))
+    for seen, joined in ((of, BROKEN), (single, none)):
+        turned, signals = sequence(seen), seen.transpose(3, 0, 1, 2).copy()
+        for field in FIELDS:
+            sums = FieldStatistics(field, 12, 3 * field.rows)
+            explicit = brute_force(views(turned, field), 12, joined)
+            assert_equal(fed(sums, seen, joined), explicit)
+            assert np.array_equal(unfold(seen, field), views(seen, field).astype(np.float32))
+        explicit = brute_force(turned.astype(np.float64), 12, joined)
+        assert_equal(fed(SampleStatistics(12, 3), signals, joined, axis=1), explicit)
 
 
-@pytest.mark.parametrize('joined', [JOINED, BROKEN])
-def test_without_rotation_only_images_at_the_same_view_are_compared(joined):
+def test_without_rotation_only_images_at_the_same_view_are_compared():
     of, field = maps(1, 6), FIELDS[1]
-    plain = fed(FieldStatistics(field, 12, 6, rotate=False), of, joined, batch=4)
+    plain = fed(FieldStatistics(field, 12, 6, rotate=False), of, BROKEN, batch=4)
     signals = of.transpose(3, 0, 1, 2).copy()
-    samples = fed(SampleStatistics(12, 3, rotate=False), signals, joined, batch=4, axis=1)
+    samples = fed(SampleStatistics(12, 3, rotate=False), signals, BROKEN, batch=4, axis=1)
     for ours, explicit in ((plain, views(of, field)), (samples, of.astype(np.float64))):
         flat = explicit.reshape(-1, explicit.shape[-1])
-        steps = np.diff(explicit, axis=0)[joined].reshape(-1, explicit.shape[-1])
+        steps = np.diff(explicit, axis=0)[BROKEN].reshape(-1, explicit.shape[-1])
         differences = len(steps) / 12, steps.T @ steps / 12
-        expected = Statistics(len(flat), flat.sum(0), flat.T @ flat, *differences)
-        assert_equal(ours, expected)
+        assert_equal(ours, Statistics(len(flat), flat.sum(0), flat.T @ flat, *differences))
 
 
 @given(batch=st.integers(1, 9), broken=st.integers(0, 7), seed=st.integers(0, 50))
@@ -137,3 +117,65 @@ def test_batches_and_merged_parts_equal_the_whole(batch, broken, seed):
         second.add(end, joined[4:])
         first.merge(second)
         assert_equal(first.result(), whole)
+
+
+PERIODS = (400.0, 130.0, 47.0, 9.0)
+
+
+def sources(count: int = 8000) -> np.ndarray:
+    """Sinusoids of falling slowness, unit variance, (N, 4)."""
+    t = np.arange(count)[:, None]
+    return np.sqrt(2) * np.sin(2 * np.pi * t / np.array(PERIODS) + np.arange(4))
+
+
+def mixed(seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return sources() @ rng.normal(size=(4, 4)) + rng.normal(size=4)
+
+
+def fitted(x: np.ndarray, outputs: int, relative_cut: float = 1e-7):
+    """The solution for a signal (N, D)."""
+    dx = np.diff(x, axis=0)
+    sums = Statistics(len(x), x.sum(0, dtype=np.float64), x.T @ x, len(dx), dx.T @ dx)
+    return solve(sums, outputs, relative_cut)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_sources_recovered_up_to_sign(seed):
+    slow = fitted(mixed(seed), 4).apply(mixed(seed))
+    correlation = np.corrcoef(slow.T, sources().T)[:4, 4:]
+    assert np.abs(np.diag(correlation)).min() > 0.999
+
+
+def test_features_white_and_slowest_first():
+    x = np.random.default_rng(3).normal(size=(500, 9)).cumsum(0)
+    solution = fitted(x, 5)
+    slow = solution.apply(x)
+    assert np.allclose(slow.mean(0), 0, atol=1e-9)
+    assert np.allclose(slow.T @ slow / len(slow), np.eye(5), atol=1e-8)
+    assert (np.diff(solution.delta) > 0).all()
+    assert np.allclose(solution.delta, (np.diff(slow, axis=0) ** 2).mean(0))
+
+
+def test_signs_are_deterministic():
+    for flip in (1.0, -1.0):
+        weights = fitted(flip * mixed(), 4).weights
+        assert (weights[np.abs(weights).argmax(0), np.arange(4)] > 0).all()
+
+
+def test_redundant_constant_and_rounded_dimensions_make_no_false_slow_features():
+    redundant = mixed() @ np.random.default_rng(7).normal(size=(4, 12))
+    solution = fitted(redundant, 4)
+    assert solution.rank == 4
+    assert fitted(redundant.astype(np.float32), 4, relative_cut=1e-6).rank == 4
+    faint = mixed() * np.array([1.0, 1e-2, 1e-2, 1e-2])
+    assert fitted(faint, 1, relative_cut=0.1).rank < 4
+    assert fitted(faint, 4, relative_cut=0.1).rank == 4, 'as many as asked for'
+    for signal, outputs, said in (
+        (redundant, 5, 'rank 4, fewer than the 5 slow features'),
+        (np.full((50, 3), 7.0), 1, 'rank 0'),
+        (np.zeros((0, 2)), 1, 'two consecutive'),
+        (np.zeros((1, 2)), 1, 'two consecutive'),
+    ):
+        with pytest.raises(DataError, match=said):
+            fitted(signal, outputs)

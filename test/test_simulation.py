@@ -12,16 +12,9 @@ from sfa_localization.camera.leveling import tilted
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 from sfa_localization.data.geometry import compose, relative, wrap_angle
-from sfa_localization.data.run import differences, integrate
-from sfa_localization.fusion.pose_filter import PoseFilter
-from sfa_localization.simulation.drive import (
-    START_NS,
-    drive,
-    lights,
-    render_images,
-    roll_and_pitch,
-    simulate,
-)
+from sfa_localization.data.run import integrate
+from sfa_localization.simulation import drive as drives
+from sfa_localization.simulation.drive import START_NS, drive, lights, render_images, simulate
 from sfa_localization.simulation.garden import Garden, panel, rounded
 from sfa_localization.simulation.rendering import Dome, Light, Scene, panorama_view, raw_view
 from sfa_localization.simulation.routes import CLEARANCE_M, Lawn
@@ -60,9 +53,6 @@ def odometry_errors(garden, config):
     return compose(garden.dock, relative(poses[0], poses)) - recorded.truth.poses
 
 
-# Pictures
-
-
 def test_a_box_appears_where_it_stands():
     """A wall 2 m wide, 1 m high at 4 m to the left of a robot looking along +x."""
     wall = panel([-1, 4, 0], [2, 0, 0], [0, 0, 1], 1.0, 'plain', (1.0, 1.0, 1.0))
@@ -84,7 +74,6 @@ def test_turning_shifts_columns(tiny):
     ahead = panorama_of(tiny, pose, SMALL).astype(int)
     turned = panorama_of(tiny, pose + np.array([0, 0, np.pi / 3]), SMALL).astype(int)
     assert np.mean(np.abs(turned - np.roll(ahead, 50, axis=1)) <= 1) > 0.995
-    assert np.mean(np.abs(turned - np.roll(ahead, -50, axis=1)) <= 1) < 0.5
     mirrored = panorama_of(tiny, pose, replace(SMALL, clockwise=False))
     assert np.array_equal(ahead[:, ::-1], mirrored)
 
@@ -106,25 +95,23 @@ def test_pictures_differ_by_place_world_light_and_noise(tiny):
         assert np.abs(here - other).mean() > 8
     dimmed = tiny.image(pose, panorama_view(SMALL), Light(exposure=0.49))
     assert np.abs(dimmed / np.maximum(here, 20) - 0.7)[here > 60].max() < 0.02
-    config = replace(TINY, illumination=0.0, length=6.0)
+    config = replace(TINY, illumination=0.0, length=3.0)
     recorded = drive(tiny, config)
     assert set(lights(recorded.image_stamps_ns, config)) == {Light()}
-    noisy = list(render_images(tiny, recorded, config, panorama_view(SMALL)))
-    assert len(noisy) == len(recorded.image_stamps_ns)
-    for picture, at in list(zip(noisy, recorded.image_poses, strict=True))[::5]:
-        clean = panorama_of(tiny, at, SMALL).astype(float)
-        inside = (clean > 10) & (clean < 245)
-        assert (picture - clean)[inside].std() == pytest.approx(1.5, rel=0.06)
     strong = lights(recorded.image_stamps_ns, replace(config, illumination=1.0))
-    assert np.ptp([light.sun for light in strong]) > 0.02
+    assert np.ptp([light.sun for light in strong]) > 0.01
+    noisy = next(iter(render_images(tiny, recorded, config, panorama_view(SMALL))))
+    clean = panorama_of(tiny, recorded.image_poses[0], SMALL).astype(float)
+    inside = (clean > 10) & (clean < 245)
+    assert (noisy - clean)[inside].std() == pytest.approx(1.5, rel=0.06)
 
 
 def test_uneven_ground_tilts_the_camera_by_place_and_heading(tiny):
     """The other way where the robot drives the other way, and a little anew in each image."""
     config, rng = replace(TINY, terrain=3.0), np.random.default_rng(0)
     poses = np.column_stack([rng.uniform(-4, 4, (200, 2)), rng.uniform(-3, 3, 200)])
-    there = np.degrees([roll_and_pitch(pose, config, k) for k, pose in enumerate(poses)])
-    back = np.degrees([roll_and_pitch(np.add(p, [0, 0, np.pi]), config, 500) for p in poses])
+    there = np.degrees([drives.roll_and_pitch(pose, config, k) for k, pose in enumerate(poses)])
+    back = np.degrees([drives.roll_and_pitch(np.add(p, [0, 0, np.pi]), config, 500) for p in poses])
     assert there.std(0) == pytest.approx([3.0, 3.0], rel=0.25)
     assert np.corrcoef(there.ravel(), back.ravel())[0, 1] < -0.9
     flat = panorama_of(tiny, tiny.dock, SMALL)
@@ -135,9 +122,6 @@ def test_uneven_ground_tilts_the_camera_by_place_and_heading(tiny):
         assert np.abs(seen - expected)[inner].mean() < 0.5 * off
 
 
-# Routes
-
-
 def test_drives_start_at_the_dock_keep_clear_and_take_pictures_as_asked(garden):
     """Nothing solid at hull height lies within the clearance, looking all around."""
     recorded = drive(garden, SimulationConfig(trajectory='test', seed=3))
@@ -145,15 +129,13 @@ def test_drives_start_at_the_dock_keep_clear_and_take_pictures_as_asked(garden):
     assert (np.abs(poses[:, :2]) <= garden.half + 0.02).all()
     solid = np.concatenate([shape.vertices[shape.faces] for shape in garden.shapes])
     solid = solid[((solid[..., 2] < 0.6) & (solid[..., 2] > 0.05)).any(1)].reshape(-1, 3)[:, :2]
-    gaps = [np.hypot(*(solid - pose[:2]).T).min() for pose in poses]
-    assert min(gaps) > CLEARANCE_M - 0.05
+    assert min(np.hypot(*(solid - p[:2]).T).min() for p in poses) > CLEARANCE_M - 0.05
     assert np.allclose(poses[0], garden.dock) and recorded.truth.stamps_ns[0] == START_NS
     spacing = np.hypot(*np.diff(recorded.image_poses[:, :2], axis=0).T)
     turns = np.abs(wrap_angle(np.diff(recorded.image_poses[:, 2])))
     straight = spacing[(turns < 0.02) & (spacing < 0.5)]
     assert np.all(np.diff(recorded.image_stamps_ns) > 0)
-    assert np.median(straight) == pytest.approx(0.2, abs=1e-3)
-    assert np.percentile(straight, 99) < 0.201
+    assert np.percentile(straight, [50, 99]) == pytest.approx(0.2, abs=1e-3)
 
 
 def test_each_route_is_what_it_promises(garden):
@@ -173,29 +155,11 @@ def test_each_route_is_what_it_promises(garden):
         assert np.ptp(np.unwrap(part[:, 2])) < 1e-6
     poses = drive(garden, SimulationConfig(trajectory='test', seed=7)).truth.poses
     assert np.hypot(*(poses[-1] - poses[0])[:2]) < 0.1
-    ways = np.diff(poses, axis=0)
-    length = np.hypot(ways[:, 0], ways[:, 1])
+    x, y, turned = np.diff(poses, axis=0).T
+    length = np.hypot(x, y)
     moving = length > 0.015
-    assert (np.abs(wrap_angle(ways[moving, 2])) / length[moving]).max() < 1 / 0.75
+    assert (np.abs(wrap_angle(turned[moving])) / length[moving]).max() < 1 / 0.75
     assert 55 < length.sum() < 75
-
-
-# Sensors
-
-
-def test_exact_twists_lead_to_the_truth_through_the_filter_and_by_sums(garden):
-    """A twist is held since the last message."""
-    config = SimulationConfig(trajectory='test', seed=3, odometry_rate=10.0, **EXACT)
-    recorded = drive(garden, config)
-    odometry, truth = recorded.odometry, recorded.truth.poses
-    summed = integrate(odometry.stamps_ns, odometry.twists, truth[0])
-    assert np.abs(relative(truth, summed)).max() < 1e-3
-    assert np.allclose(differences(odometry.stamps_ns, truth)[1:], odometry.twists[1:], atol=1e-6)
-    fused = PoseFilter()
-    fused.set_pose(int(odometry.stamps_ns[0]), truth[0])
-    for stamp_ns, twist, pose in zip(odometry.stamps_ns, odometry.twists, truth, strict=True):
-        fused.add_odometry(int(stamp_ns), *twist)
-        assert np.abs(relative(pose, fused.state.pose)).max() < 1e-3
 
 
 def test_odometry_drifts_like_the_papers_robot_or_as_drawn_or_not(garden):
@@ -209,8 +173,12 @@ def test_odometry_drifts_like_the_papers_robot_or_as_drawn_or_not(garden):
     covering, drawn = drifts(), drifts(trajectory='test', test_drift=0.0)
     assert 1.0 < np.mean(covering) < 3.0 and len(set(np.round(covering, 6))) == 4
     assert min(drawn) > 0.05 and max(drawn) < 1.5 and np.std(drawn) > 0.02
-    off = odometry_errors(garden, SimulationConfig(seed=2, **EXACT))
+    exact = SimulationConfig(trajectory='test', seed=3, odometry_rate=10.0, **EXACT)
+    off = odometry_errors(garden, exact)
     assert np.abs(off[:, :2]).max() < 1e-6 and np.abs(wrap_angle(off[:, 2])).max() < 1e-9
+    recorded = drive(garden, exact)  # a twist is held since the last message
+    summed = integrate(recorded.odometry.stamps_ns, recorded.odometry.twists, garden.dock)
+    assert np.abs(relative(recorded.truth.poses, summed)).max() < 1e-3
 
 
 def test_twist_variance_is_honest(garden):
@@ -224,39 +192,29 @@ def test_twist_variance_is_honest(garden):
     assert np.mean(ratios, 0) == pytest.approx([1, 1], abs=0.2)
 
 
-# Light and season
-
-
-def test_light_and_season_change_plants_only_and_no_drive():
-    gardens = {}
+def test_light_and_season_change_plants_only_and_no_drive(tiny):
+    leaves, first = [], drive(tiny, TINY)
     for season, light in zip(SEASONS, ('day', 'evening', 'overcast'), strict=True):
         config = replace(TINY, season=season, light=light)
-        gardens[season] = Garden(1, config)
-        later, changed = drive(gardens[season], config), set()
-        first = drive(gardens['summer'], TINY)
+        garden, changed = Garden(1, config), set()
+        later = drive(garden, config)
         assert np.array_equal(later.image_poses, first.image_poses)
         assert np.array_equal(later.odometry.twists, first.odometry.twists)
-        for before, after in zip(gardens['summer'].shapes, gardens[season].shapes, strict=True):
+        for before, after in zip(tiny.shapes, garden.shapes, strict=True):
             assert np.array_equal(before.vertices, after.vertices)
             if before.tint != after.tint or len(before.faces) != len(after.faces):
                 changed.add(before.plant)
         plants = {'grass', 'crown', 'bush', 'bloom', 'hedge'}
         assert changed == (set() if season == 'summer' else plants)
-    leaves = [
-        sum(len(shape.faces) for shape in garden.shapes if shape.plant == 'crown')
-        for garden in gardens.values()
-    ]
+        leaves.append(sum(len(s.faces) for s in garden.shapes if s.plant == 'crown'))
     assert leaves[0] > leaves[1] > 2 * leaves[2] > 0
 
 
-# Bags
-
-
-def test_same_seeds_same_bytes(tmp_path):
-    for storage in ('mcap', 'sqlite3'):
-        config, written = replace(TINY, length=4.0, storage=storage), []
-        for number, seed in enumerate((1, 1, 2)):
-            bag = tmp_path / storage / str(number) / 'bag'
-            simulate(replace(config, seed=seed), bag, SMALL)
-            written.append({file.name: file.read_bytes() for file in bag.iterdir()})
-        assert written[0] == written[1] != written[2]
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_same_seeds_same_bytes(tmp_path, storage):
+    config, written = replace(TINY, length=2.0, storage=storage), []
+    for number, seed in enumerate((1, 1, 2)):
+        bag = tmp_path / str(number) / 'bag'
+        simulate(replace(config, seed=seed), bag, SMALL)
+        written.append({file.name: file.read_bytes() for file in bag.iterdir()})
+    assert written[0] == written[1] != written[2]

@@ -5,37 +5,23 @@
 from dataclasses import replace
 from functools import cache
 
-import cv2
 import numpy as np
 import pytest
-from cylinder_worlds import Spheres, alone, recipe, run_in, wander
+from cylinder_worlds import Spheres, recipe, run_in, wander
 from test_keyframes import HOME, drive, errors, familiar, keyframes_of, unseen
 
 from sfa_localization.camera.leveling import NEAR_NS, leveled, tilted, tilts_at
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.run import PanoramaArray
-from sfa_localization.data.sphere import Sphere, rotation
+from sfa_localization.data.sphere import Sphere
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.leveling import leveled_runs
 from sfa_localization.keyframes.texture import spectrum, texture, turned
-from sfa_localization.keyframes.tilt import derivatives, find_tilt
-from sfa_localization.keyframes.upright import upright
+from sfa_localization.keyframes.tilt import find_tilt
 
 BOTH = pytest.mark.parametrize('clockwise', [True, False])
 SPHERE = Sphere(-0.6, 0.6)
-
-
-def config(clockwise: bool = True) -> PanoramaConfig:
-    return PanoramaConfig(
-        width=160, height=40, elevation_min=-34.4, elevation_max=34.4, clockwise=clockwise
-    )
-
-
-def smooth(sphere: Sphere, rows: int = 40, columns: int = 160) -> np.ndarray:
-    """A panorama (rows, columns) of random blobs."""
-    rough = np.random.default_rng(3).normal(size=(rows, 3 * columns)).astype(np.float32)
-    rough[:, :columns] = rough[:, -columns:] = rough[:, columns : 2 * columns]
-    return 40 * cv2.GaussianBlur(rough, (0, 0), 3)[:, columns : 2 * columns]
+CONFIG = PanoramaConfig(width=160, height=40, elevation_min=-34.4, elevation_max=34.4)
 
 
 @BOTH
@@ -52,43 +38,23 @@ def test_things_sink_in_the_image_where_the_camera_rises(clockwise):
         assert moved == pytest.approx(expected, abs=0.1)
 
 
-@BOTH
-def test_the_derivatives_are_those_of_the_tilted_panorama(clockwise):
-    sphere = Sphere(-0.6, 0.6, clockwise)
-    image = smooth(sphere)
-    for k, tilt in enumerate(np.eye(2) * 0.004):
-        ahead, behind = (tilted(image[..., None], s * tilt, sphere)[..., 0] for s in (1, -1))
-        numeric, analytic = (ahead - behind) / 0.008, derivatives(image, [slice(0, 40)], sphere)[k]
-        inner = np.s_[3:-3]
-        assert np.corrcoef(numeric[inner].ravel(), analytic[inner].ravel())[0, 1] > 0.99
-        assert np.std(analytic[inner]) == pytest.approx(np.std(numeric[inner]), rel=0.05)
-
-
 def test_leveling_undoes_a_tilt():
-    image, tilt = smooth(SPHERE)[..., None], np.array([0.05, -0.07])
-    assert np.allclose(rotation(*tilt) @ rotation(*tilt).T, np.eye(3))
+    image, tilt = HOME.panoramas(np.zeros((1, 3)), CONFIG)[0], np.array([0.05, -0.07])
     back = leveled(tilted(image, tilt, SPHERE), tilt, SPHERE)
-    assert np.abs(back - image)[8:-8].mean() < 0.1 * np.abs(image).mean()
+    off = np.abs(back - image.astype(float))[8:-8]
+    assert off.mean() < 0.1 * np.abs(image - image.mean()).mean()
 
 
-@pytest.mark.parametrize('degrees', [(0, 0), (3, -2), (-8, 5), (0, 10)])
+@pytest.mark.parametrize('degrees', [(0, 0), (-8, 5), (0, 10)])
 def test_the_tilt_between_two_textures_is_measured(degrees):
-    tilt = np.radians(degrees)
-    poses = np.array([[0.0, 0, 0], [4, 4, 1], [-4, 3, 2]])
-    images = HOME.panoramas(poses, config())
+    tilt, turn = np.radians(degrees), np.array([0.0, 1.0, 0.0])
+    images = HOME.panoramas(np.array([[0.0, 0, 0], [4, 4, 1], [-4, 3, 2]]), CONFIG)
+    channels = slice(0, 16), slice(16, 24), slice(24, 32)
     others = spectrum(np.stack([texture(image) for image in images]))
-    channels, turn = (slice(0, 16), slice(16, 24), slice(24, 32)), np.array([0.0, 1.0, 0.0])
     seen = spectrum(texture(tilted(images[0], tilt, SPHERE)))
     tilts, scores = find_tilt(seen, turned(others, -turn), turn, 80, channels, SPHERE)
     assert scores.argmax() == 0
     assert np.hypot(*(tilts[0] - tilt)) < 0.7 * 1.2 / 16  # of a row
-
-
-def test_nothing_to_see_is_level():
-    nothing = np.zeros((32, 41), np.complex64)
-    channels = slice(0, 16), slice(16, 24), slice(24, 32)
-    tilts, _ = find_tilt(nothing, nothing[None], np.zeros(1), 80, channels, SPHERE)
-    assert np.array_equal(tilts, np.zeros((1, 2)))
 
 
 def swayed(images: np.ndarray, degrees: float, seed: int, sphere: Sphere = SPHERE):
@@ -98,47 +64,20 @@ def swayed(images: np.ndarray, degrees: float, seed: int, sphere: Sphere = SPHER
 
 
 @cache
-def learnt(degrees: float) -> Keyframes:
-    """Keyframes of such a robot."""
-    images, _ = swayed(HOME.panoramas(drive(), config()), degrees, 0)
-    return keyframes_of([images], [drive()], [0], config())
+def learnt() -> Keyframes:
+    return keyframes_of([HOME.panoramas(drive(), CONFIG)], [drive()], [0], CONFIG)
 
 
-def errors_of_unseen(keyframes: Keyframes, degrees: float):
-    """Of 40 images of such a robot: in m, rad of yaw, and rad of tilt; and their locations."""
-    images, tilts = swayed(HOME.panoramas(unseen(40), config()), degrees, 1)
-    far, turned, locations = errors(keyframes, images, unseen(40))
-    estimates = np.array([location.tilt for location in locations])
-    rest = np.hypot(*(estimates - tilts).T)
-    return far, turned, rest, locations
-
-
-def test_a_tilted_image_is_located_like_a_level_one(degrees=4.0):
-    flat, turned, *_ = errors_of_unseen(learnt(0.0), 0.0)
-    off, swung, rest, locations = errors_of_unseen(learnt(0.0), degrees)
+def test_a_tilted_image_is_located_like_a_level_one():
+    images = HOME.panoramas(unseen(40), CONFIG)
+    flat, turns, _ = errors(learnt(), images, unseen(40))
+    images, tilts = swayed(images, 4.0, 1)
+    off, swung, locations = errors(learnt(), images, unseen(40))
     assert off.mean() < 1.5 * flat.mean() + 0.01
-    assert swung.mean() < turned.mean() + np.radians(0.3)
+    assert swung.mean() < turns.mean() + np.radians(0.3)
+    rest = np.hypot(*(np.array([location.tilt for location in locations]) - tilts).T)
     assert np.degrees(np.median(rest)) < 0.5
     assert all(map(familiar, locations))
-
-
-@pytest.mark.parametrize('degrees', [(12, 2), (-3, 11)])
-def test_what_a_steep_tilt_hides_counts_neither_for_nor_against_a_place(degrees):
-    keyframes, tilt = learnt(0.0), np.radians(degrees)
-    poses = np.column_stack([np.linspace(-1.4, 1.3, 8), np.linspace(1.2, -1.1, 8), np.arange(8)])
-    for image in HOME.panoramas(poses, config()):
-        both = image, tilted(image, tilt, SPHERE)
-        flat, steep = (alone(keyframes, each) for each in both)
-        like, as_like = (upright(keyframes, each).score for each in both)
-        assert as_like == pytest.approx(like, abs=0.1)
-        assert np.hypot(*(steep.pose - flat.pose)[:2]) < 0.3
-        assert np.hypot(*(steep.tilt - tilt)) < np.radians(1.0)
-
-
-def test_keyframes_of_a_tilted_robot_show_the_place_too():
-    flat, *_ = errors_of_unseen(learnt(0.0), 0.0)
-    off, *_ = errors_of_unseen(learnt(2.0), 2.0)
-    assert off.mean() < 2.0 * flat.mean() + 0.02
 
 
 @BOTH
@@ -148,6 +87,8 @@ def test_drives_are_leveled_before_they_are_learned_from(clockwise):
     level = run_in(Spheres.about(1), wander(240, 2, hz=4.0), panorama)
     (same,) = leveled_runs([level], panorama.sphere)
     assert same is level
+    few = run_in(Spheres.about(1), wander(3, 2, hz=4.0), panorama)
+    assert leveled_runs([few], panorama.sphere) == (few,), 'nothing is seen again'
     images, tilts = swayed(level.panoramas.images, 4.0, 0, panorama.sphere)
     run = replace(level, panoramas=PanoramaArray(level.panoramas.stamps_ns, images))
     counted = []
@@ -157,12 +98,6 @@ def test_drives_are_leveled_before_they_are_learned_from(clockwise):
     assert np.median(rest) < 0.25 * np.median(np.hypot(*tilts.T))
     batches = np.concatenate(list(leveled_run.panoramas.batches(64)))
     assert np.array_equal(batches, leveled_run.panoramas.read(0, 240)) and len(batches) == 240
-
-
-def test_a_drive_without_revisited_places_is_not_leveled():
-    panorama = recipe().panorama
-    run = run_in(Spheres.about(1), wander(3, 2, hz=4.0), panorama)
-    assert leveled_runs([run], panorama.sphere) == (run,)
 
 
 def test_the_orientation_of_an_image_is_that_near_its_stamp():

@@ -3,9 +3,11 @@
 """Training from bags: what it leaves behind, how it goes on, and what it refuses."""
 
 import logging
+import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -38,31 +40,25 @@ class Cut(Exception):
 
 def cut_off(bag: Path, output: Path, stages: int, error: BaseException) -> None:
     """Train until `stages` stages are finished, and be cut off there."""
-    with pytest.MonkeyPatch.context() as patch:
-        write, done = checkpoints.Checkpoint.write, []
+    write, done = checkpoints.Checkpoint.write, []
 
-        def write_then_fail(self, partial):
-            write(self, partial)
-            done.append(partial)
-            if len(done) == stages:
-                raise error
+    def write_then_fail(self, partial):
+        write(self, partial)
+        done.append(partial)
+        if len(done) == stages:
+            raise error
 
-        patch.setattr(checkpoints.Checkpoint, 'write', write_then_fail)
-        with pytest.raises(type(error)):
-            train([bag], output, SMALL_RECIPE)
-
-
-def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
+    replaced = mock.patch.object(checkpoints.Checkpoint, 'write', write_then_fail)
+    with replaced, pytest.raises(type(error)):
+        train([bag], output, SMALL_RECIPE)
 
 
 def test_a_training_leaves_the_model_and_says_what_error_to_expect(trained):
     """And where it is worst; what is reported is of the map that the model holds."""
     model, result = PlaceModel.load(trained.model), trained.result
     quality, told = model.quality, summary(result)
-    assert names(trained.model.parent) == ['model.npz']
+    assert os.listdir(trained.model.parent) == ['model.npz']
     assert quality['pictures'] == PICTURES and quality['certified'] and quality['turned']
-    assert result.features.shape == (PICTURES, 6)
     worst = quality['worst']
     assert 0.0 < quality['expected_error_m'] < worst['expected_error_m']
     assert f'position: expect {quality["expected_error_m"]:.2f} m mean error of one image' in told
@@ -95,10 +91,10 @@ def test_resuming_gives_the_same_bytes(trained, tmp_path, stages, error):
     """As a training that was not interrupted."""
     output = tmp_path / 'model.npz'
     cut_off(trained.bag, output, stages, error)
-    assert names(tmp_path) == ['.model.npz.checkpoint.npz']
+    assert os.listdir(tmp_path) == ['.model.npz.checkpoint.npz']
     train([trained.bag], output, SMALL_RECIPE, resume=True)
     assert output.read_bytes() == trained.model.read_bytes()
-    assert names(tmp_path) == ['model.npz']
+    assert os.listdir(tmp_path) == ['model.npz']
 
 
 def test_a_damaged_checkpoint_and_that_of_another_training_are_refused(trained, tmp_path):
@@ -122,8 +118,7 @@ def test_after_an_error_no_model_is_left(trained, tmp_path, late, monkeypatch):
     by = SMALL_RECIPE if late else replace(SMALL_RECIPE, architecture=wrong)
     with pytest.raises(LocalizationError):
         train([trained.bag], tmp_path / 'model.npz', by)
-    assert 'model.npz' not in names(tmp_path)
-    assert not any('cache' in name for name in names(tmp_path))
+    assert not any('cache' in name or name == 'model.npz' for name in os.listdir(tmp_path))
 
 
 def _fail(*args, **kwargs):
@@ -133,17 +128,14 @@ def _fail(*args, **kwargs):
 def test_bags_and_outputs_that_cannot_be_are_refused(trained, tmp_path):
     """Of a copy, what is left out would be known, and the forecast would promise too much."""
     other, bag = write_bag(tmp_path / 'other', size=(12, 96)), trained.bag
-    (tmp_path / 'file').write_text('')
-    (tmp_path / 'link').symlink_to('/dev/null')
     for bags, output, error, why in (
         ([bag, other], 'm.npz', DataError, r'different sizes \(drive: 72x12, other: 96x12\)'),
         ([bag, bag], 'm.npz', DataError, r'the same drive as .*: name each drive once'),
-        ([bag], 'file/m.npz', ModelError, 'cannot be written'),
-        ([bag], 'link', ModelError, 'no regular file'),
+        ([bag], 'other/metadata.yaml/m.npz', ModelError, 'cannot be written'),
     ):
         with pytest.raises(error, match=why):
             train(bags, tmp_path / output, SMALL_RECIPE)
-    assert names(tmp_path) == ['file', 'link', 'other']
+    assert os.listdir(tmp_path) == ['other']
 
 
 def test_the_mdp_engine_learns_the_same_place(trained, tmp_path):
@@ -154,19 +146,15 @@ def test_the_mdp_engine_learns_the_same_place(trained, tmp_path):
         assert abs(np.corrcoef(a, b)[0, 1]) > 0.999
 
 
-def straight_route():
-    """A drive straight ahead of 12 m, whose odometry states no variance."""
+@pytest.mark.slow
+def test_a_straight_route_gives_a_model_and_a_warning(caplog):
+    """Of 12 m, with odometry that states no variance."""
     count, speed = 250, 0.12
     stamps = 10**9 + np.arange(count) * round(12e9 / speed / count)
     twists = np.tile([speed, 0.0], (count, 1))
     poses = integrate(stamps, twists, np.array([-6.0, 0.0, 0.0]))
     odometry = Odometry(stamps, poses, twists, np.zeros((count, 2)))
-    return run_in(Spheres.about(1), odometry, recipe().panorama)
-
-
-@pytest.mark.slow
-def test_a_straight_route_gives_a_model_and_a_warning(caplog):
-    run = straight_route()
+    run = run_in(Spheres.about(1), odometry, recipe().panorama)
     network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
     with warnings.catch_warnings(), caplog.at_level(logging.WARNING):
         warnings.simplefilter('error')
@@ -178,11 +166,8 @@ def test_a_straight_route_gives_a_model_and_a_warning(caplog):
     off = trained.model.locate_all(Spheres.about(1).panoramas(aside, recipe().panorama))
     places = np.array([image.position for image in on])
     assert np.hypot(*(places - run.odometry.poses[90:160, :2]).T).mean() < 0.1
-    surest, least = (
-        pick(np.trace(image.covariance[:2, :2]) for image in part)
-        for pick, part in ((max, on), (min, off))
-    )
-    assert least > 10 * surest
+    on_route, off_route = ([np.trace(e.covariance[:2, :2]) for e in part] for part in (on, off))
+    assert min(off_route) > 10 * max(on_route)
     with pytest.raises(DataError, match='no track crosses another'):
         learn_place(network, [run], recipe(), strict=True)
 

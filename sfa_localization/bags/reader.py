@@ -22,8 +22,8 @@ from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.settings import BagConfig
 from sfa_localization.bags.topic_stream import Item, Stream
 from sfa_localization.data.errors import BagError, LocalizationError, MessageError
-from sfa_localization.data.messages import NO_STAMP, read_stamp, read_yaw_rate
-from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate
+from sfa_localization.data.messages import NO_STAMP, read_stamp
+from sfa_localization.data.run import Count, Image, Odometry, Trajectory
 
 PUBLISHED = re.compile(r'/(ekf|sfa)/|/panorama(/compressed)?$')
 """Topics of omnicam_node, sfa_node and ekf_node; an input is preferred to them."""
@@ -127,16 +127,6 @@ class Bag:
     def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
         """Stamps and images (H, W, 3) BGR, one at a time."""
         return self._values(self.stream(self.find('image', topic), decoding.image_of))
-
-    def odometry(self, topic: str = '') -> Odometry:
-        """All odometry; of a topic with poses only, twists are their differences."""
-        stream = self.stream(self.find('odometry', topic), decoding.odometry_of)
-        return self.to_odometry(stream, list(self._values(stream)))
-
-    def yaw_rate(self, topic: str = '') -> YawRate:
-        """All yaw rates of an Imu."""
-        stream = self.stream(self.find('imu', topic), read_yaw_rate)
-        return motion.to_yaw_rate(list(self._values(stream)))
 
     def trajectory(self, topic: str = '') -> Trajectory:
         """All poses of a topic, by default of the true poses."""

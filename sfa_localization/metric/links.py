@@ -33,8 +33,7 @@ _PRIOR_LINKS = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """L turns and displacements from segments `at` (L,) to the next, as in `Segment`; those of
-    infinite variance have no weight."""
+    """L turns and displacements from segments `at` (L,) to the next, as in `Segment`."""
 
     at: Indices
     run: Indices
@@ -73,7 +72,6 @@ class Links:
         """Derivative (2 L, 4 + D) of these residuals by the mount (mount.py): by the slip of
         base_link ahead and to the left, m per rad of a turn, alone."""
         slip = -poses.z[self.at] * (np.exp(1j * self.turn_rad) - 1)
-        slip = np.where(np.isfinite(self.displacement_variance), slip, 0.0)
         columns = np.zeros((2 * len(slip), 5 + int(stack.run.max())), complex)
         columns[len(slip) :, 2] = slip / np.sqrt(self.displacement_variance)
         columns[:, 3] = 1j * columns[:, 2]
@@ -100,15 +98,12 @@ def _grown(
     stated: Array, assumed: Array, squares: Array, uncertain: Array, run: Indices, axes: int
 ) -> Array:
     """Variances (L,) per axis: the stated ones times a factor of each run, and more for single
-    links with far larger residuals (Student's distribution). An infinite variance stays.
+    links with far larger residuals (Student's distribution).
 
     A solution with `assumed` variances has `squares` of residuals, and is `uncertain` of them.
     """
-    finite = np.isfinite(stated)
-    unit = np.where(finite, stated, 1.0)
-    free = finite * (1.0 - np.minimum(uncertain / assumed, 1.0))
-    freedom = np.bincount(run, free) + _PRIOR_LINKS
-    error, misfit = (squares + uncertain) / unit, finite * squares / unit
+    freedom = np.bincount(run, 1.0 - np.minimum(uncertain / assumed, 1.0)) + _PRIOR_LINKS
+    error, misfit = (squares + uncertain) / stated, squares / stated
     factor = np.ones(len(freedom))
     for _ in range(_STEPS):
         outlier = outlier_factor(axes * error / factor[run], axes)

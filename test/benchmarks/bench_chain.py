@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import itertools
 import json
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from subprocess import PIPE, STDOUT, TimeoutExpired
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from sensor_msgs.msg import Image
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from bench_core import images_of
-from ros_bench import DEADLINE_S, DOMAIN, Spinner, end_process, start_node
+from ros_bench import DEADLINE_S, DOMAIN, FRAMES, Spinner, start_process, until
 
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.nodes.conversions import to_image, to_odometry
@@ -36,6 +36,21 @@ from sfa_localization.place_model import PlaceModel
 
 ODOMETRY_HZ, IDLE_S = 50.0, 1.0
 NAMESPACE = '/bench'
+
+
+def start_node(name, *parameters, **options):
+    """The process of a node."""
+    words = ['--ros-args', '-r', f'__ns:={NAMESPACE}', *(w for p in parameters for w in ('-p', p))]
+    return start_process('-m', 'sfa_localization', name, *words, **options)
+
+
+def end_process(process):
+    """Ask it to end, and make it where it does not."""
+    process.terminate()
+    with suppress(TimeoutExpired):
+        process.wait(DEADLINE_S)
+    process.kill()
+    process.wait()
 
 
 class Driver:
@@ -81,9 +96,8 @@ class Driver:
 
     def move(self, stamp_ns: int, pose: Any, twist: Any) -> None:
         """Send one odometry message."""
-        frames = 'odom', 'base_link'
-        message = to_odometry(pose, np.eye(3), twist, np.eye(2) * 1e-6, stamp_ns, frames)
-        self.odometry.publish(message)
+        moved = pose, np.eye(3), twist, np.eye(2) * 1e-6
+        self.odometry.publish(to_odometry(*moved, stamp_ns, FRAMES))
 
     def show(self, image: np.ndarray, stamp_ns: int) -> None:
         """Send one image."""
@@ -112,7 +126,7 @@ def parameters_of(model: PlaceModel, path: Path | str) -> dict[str, list[str]]:
 @contextmanager
 def running(parameters: dict[str, list[str]]) -> Iterator[list[Any]]:
     """Start the nodes, and end them; yields their processes."""
-    processes = [start_node(name, *p, namespace=NAMESPACE) for name, p in parameters.items()]
+    processes = [start_node(name, *p) for name, p in parameters.items()]
     try:
         yield processes
     finally:
@@ -126,23 +140,19 @@ def cpu_s(processes: list[Any]) -> float:
     return float(sum(spent.user + spent.system for spent in times))
 
 
-def bench_nodes(path: Path, bag: Path, seconds: float) -> dict[str, float]:
+def bench_nodes(path: Path, bag: Path, seconds: float = 8.0) -> dict[str, float]:
     """Share of a core at 10 and 30 images a second, and the latency at 30, in ms."""
     parameters = parameters_of(PlaceModel.load(path), path)
     parameters['ekf_node'] = ['initial_pose:=[0.0, 0.0, 0.0]']
     driver, figures = Driver(images_of(bag)), {}
     try:
         with running(parameters) as processes:
-            end = time.monotonic() + DEADLINE_S
-            while not driver.latencies_s:
-                if time.monotonic() > end:
-                    raise RuntimeError('the nodes do not answer')
-                driver.stand(10.0, 0.5)
+            if not until(lambda: driver.stand(10.0, 0.5) or driver.latencies_s):
+                raise RuntimeError('the nodes do not answer')
             for rate_hz in (10, 30):
                 before = cpu_s(processes)
                 driver.stand(rate_hz, seconds)
-                used = cpu_s(processes) - before
-                figures[f'cpu_{rate_hz}_hz'] = used / (seconds + IDLE_S)
+                figures[f'cpu_{rate_hz}_hz'] = (cpu_s(processes) - before) / (seconds + IDLE_S)
             median, late = np.percentile(driver.latencies_s, [50, 99]) * 1e3
             return {**figures, 'latency_p50_ms': float(median), 'latency_p99_ms': float(late)}
     finally:
@@ -153,12 +163,11 @@ def bench_start(path: Path) -> dict[str, float]:
     """CPU time from exec to active, in s, and the resident memory then, in MiB: the most of all."""
     figures = []
     for node, given in parameters_of(PlaceModel.load(path), path).items():
-        pipe = {'stdout': subprocess.PIPE, 'stderr': subprocess.STDOUT, 'text': True}
-        process = start_node(node, *given, **pipe)
+        process = start_node(node, *given, stdout=PIPE, stderr=STDOUT, text=True)
         try:
             next(line for line in process.stdout if line.rstrip().endswith(': active'))
-            memory = psutil.Process(process.pid).memory_info().rss
-            figures.append((cpu_s([process]), memory / 2**20))
+            rss = psutil.Process(process.pid).memory_info().rss
+            figures.append((cpu_s([process]), rss / 2**20))
         finally:
             end_process(process)
     active_s, memory_mib = map(float, np.max(figures, axis=0))
@@ -167,5 +176,5 @@ def bench_start(path: Path) -> dict[str, float]:
 
 if __name__ == '__main__':
     model_path, bag_path = map(Path, sys.argv[1:3])
-    length_s = float(sys.argv[3]) if sys.argv[3:] else 8.0
-    print(json.dumps({**bench_nodes(model_path, bag_path, length_s), **bench_start(model_path)}))
+    chain = bench_nodes(model_path, bag_path, *map(float, sys.argv[3:4]))
+    print(json.dumps({**chain, **bench_start(model_path)}))

@@ -20,7 +20,6 @@ import threading
 import time
 from collections import deque
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
@@ -30,9 +29,8 @@ from std_msgs.msg import String
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from bench_chain import NAMESPACE, Driver, parameters_of
+from bench_chain import Driver, end_process, parameters_of, start_node
 from cylinder_worlds import Spheres, place, recipe
-from ros_bench import end_process, start_node
 
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.data.threads import one_core
@@ -139,16 +137,12 @@ class Nodes:
     def __init__(self, model: PlaceModel, folder: Path) -> None:
         model.save(folder / 'model.npz')
         self.parameters = parameters_of(model, folder / 'model.npz')
-        self.running = {name: self.start(name) for name in self.parameters}
-
-    def start(self, name: str) -> Any:
-        """Start the process of a node."""
-        return start_node(name, *self.parameters[name], namespace=NAMESPACE)
+        self.running = {name: start_node(name, *p) for name, p in self.parameters.items()}
 
     def restart(self, name: str) -> None:
         """End a node, and start it again."""
         end_process(self.running[name])
-        self.running[name] = self.start(name)
+        self.running[name] = start_node(name, *self.parameters[name])
 
     def held(self) -> dict[str, dict[str, float]]:
         """Return what each process holds; raises RuntimeError for one that has ended."""
@@ -243,8 +237,7 @@ def main() -> int:
     options = parser.parse_args()
     figures, wrong = soak(options.seconds, options.pace)
     sys.stdout.write(json.dumps(figures, indent=2) + '\n')
-    for reason in wrong:
-        sys.stderr.write(f'soak: {reason}\n')
+    sys.stderr.writelines(f'soak: {reason}\n' for reason in wrong)
     return 1 if wrong else 0
 
 

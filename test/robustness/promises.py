@@ -23,10 +23,9 @@ PROMISES = {
         ('NaN in any output', 'not published'),
     'test_robustness.py::test_of_panoramas_that_come_too_fast_the_newest_is_located':
         ('panoramas faster than they are located', 'the newest is located, older ones are dropped'),
-    'test_robustness.py::test_of_odometry_that_comes_too_fast_the_newest_is_used':
-        ('odometry faster than it is fused', 'the newest is fused, the oldest are dropped'),
-    'test_robustness.py::test_odometry_that_piled_up_is_fused_at_once_and_said_to_be_behind':
-        ('a computer that is too busy', 'the state says by how many seconds it is behind'),
+    'test_robustness.py::'
+    'test_of_odometry_that_comes_too_fast_the_newest_is_used_and_said_to_be_behind':
+        ('odometry faster than it is fused', 'the newest is fused; the state says how late it is'),
     'test_ekf_node.py::test_frames_and_quality_of_service_are_parameters':
         ('publishers with another quality of service', '`qos_overrides` of each topic'),
     # Time.
@@ -60,7 +59,7 @@ PROMISES = {
         ('a place outside of the training', 'images are rejected as unlike those of training'),
     'test_omnicam_node.py::test_a_silent_camera_shows_in_diagnostics':
         ('a camera that falls silent', '`/diagnostics` says for how long'),
-    'test_sources.py::test_a_defect_in_the_thread_is_reported_and_the_source_opened_again':
+    'test_capture.py::test_a_defect_in_the_thread_is_reported_and_the_source_opened_again':
         ('an exception while a camera is read', 'the camera is opened again'),
     'test_health.py::test_each_fault_is_found_with_its_size_and_named':
         ('a camera that was moved or turned', 'DEGRADED, with the distance or angle'),

@@ -106,7 +106,7 @@ def _paper(
 ) -> None:
     """Announce the duration of the paper's results, then complete them in one folder."""
     plan, training = QUICK if arguments.quick else FULL, tuple(arguments.training)
-    work = Work(out, config, plan, Progress(visible=True), training, arguments.test)
+    work = Work(out, config, plan, Progress(shown=True), training, arguments.test)
     lights = light.QUICK if arguments.quick else light.FULL
     work.announce(names, lights.minutes if arguments.study == 'all' else 0)
     for name in names:

@@ -50,7 +50,7 @@ def _judge(out: Path, config: StudyConfig, area: tuple[float, float], every: flo
             folder / route,
             replace(base, trajectory=route, seed=config.seed + n),
             PANORAMA,
-            Progress(visible=True),
+            Progress(shown=True),
         )
         for n, route in enumerate(('coverage', 'test'))
     ]

@@ -23,7 +23,7 @@ from sfa_localization.data.geometry import Array, RigidTransform, align, compose
 from sfa_localization.data.run import Image, Run, Trajectory
 from sfa_localization.evaluation import has_truth, score
 from sfa_localization.fusion.pose_filter import PoseFilter
-from sfa_localization.fusion.replay import Track, replay
+from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.keyframes.light import Conditions
@@ -225,7 +225,7 @@ class Trial:
         ]
         steps = replay(fused, run.odometry, stamps, images)
         path = [fused.at(stamp_ns) for stamp_ns, image, _ in steps if image is None]
-        return Track.of([state for state in path if state is not None]).poses
+        return FilterTrack.of([state for state in path if state is not None]).poses
 
 
 def start_of(run: Run) -> Array:
