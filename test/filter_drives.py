@@ -38,6 +38,11 @@ def snapshot(fused):
     return state.stamp_ns, state.mean.tolist(), state.covariance.tolist()
 
 
+def seconds_of(event):
+    """Of the drive."""
+    return (event[0] - START_NS) * 1e-9
+
+
 def stamps(count, rate_hz, start_ns=START_NS):
     return start_ns + np.round(np.arange(count) * 1e9 / rate_hz).astype(np.int64)
 
@@ -123,7 +128,7 @@ class FilterDrive:
         """
         listed = [(s, 0, i) for i, s in enumerate(self.stamps_ns.tolist())]
         listed += [(s, 1, k) for k, s in enumerate(self.stamps_ns[self.pictures].tolist())]
-        return sorted(each for each in listed if start <= (each[0] - START_NS) * 1e-9 < stop)
+        return sorted(each for each in listed if start <= seconds_of(each) < stop)
 
     def give(self, fused, event, heading=False):
         stamp_ns, kind, index = event
