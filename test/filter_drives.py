@@ -70,7 +70,7 @@ def lasting(rng, fades, size):
 @dataclass
 class FilterDrive:
     """A drive to be fed to a filter: odometry in order, an image every `every` samples with the
-    covariance of its errors.
+    covariance of its errors, or of `claimed_m`.
     """
 
     seconds: float = 30.0
@@ -86,6 +86,7 @@ class FilterDrive:
     scale: float = 1.0
     share: float = 0.0
     length: float = 0.6
+    claimed_m: float | None = None
     seed: int = 0
 
     def __post_init__(self):
@@ -120,6 +121,8 @@ class FilterDrive:
 
     def covariance(self, heading):
         position, yaw = max(self.position_std, 0.05), max(self.yaw_std, 0.02)
+        if self.claimed_m is not None:
+            position, yaw = self.claimed_m, self.claimed_m / 10
         return np.diag(np.square([position, position, yaw][: 3 if heading else 2]))
 
     def events(self, start=0, stop=math.inf):
