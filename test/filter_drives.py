@@ -38,6 +38,11 @@ def snapshot(fused):
     return state.stamp_ns, state.mean.tolist(), state.covariance.tolist()
 
 
+def seconds_of(event):
+    """Of the drive."""
+    return (event[0] - START_NS) * 1e-9
+
+
 def stamps(count, rate_hz, start_ns=START_NS):
     return start_ns + np.round(np.arange(count) * 1e9 / rate_hz).astype(np.int64)
 
@@ -65,7 +70,7 @@ def lasting(rng, fades, size):
 @dataclass
 class FilterDrive:
     """A drive to be fed to a filter: odometry in order, an image every `every` samples with the
-    covariance of its errors.
+    covariance of its errors, or of `claimed_m`.
     """
 
     seconds: float = 30.0
@@ -81,6 +86,7 @@ class FilterDrive:
     scale: float = 1.0
     share: float = 0.0
     length: float = 0.6
+    claimed_m: float | None = None
     seed: int = 0
 
     def __post_init__(self):
@@ -115,6 +121,8 @@ class FilterDrive:
 
     def covariance(self, heading):
         position, yaw = max(self.position_std, 0.05), max(self.yaw_std, 0.02)
+        if self.claimed_m is not None:
+            position, yaw = self.claimed_m, self.claimed_m / 10
         return np.diag(np.square([position, position, yaw][: 3 if heading else 2]))
 
     def events(self, start=0, stop=math.inf):
@@ -123,7 +131,7 @@ class FilterDrive:
         """
         listed = [(s, 0, i) for i, s in enumerate(self.stamps_ns.tolist())]
         listed += [(s, 1, k) for k, s in enumerate(self.stamps_ns[self.pictures].tolist())]
-        return sorted(each for each in listed if start <= (each[0] - START_NS) * 1e-9 < stop)
+        return sorted(each for each in listed if start <= seconds_of(each) < stop)
 
     def give(self, fused, event, heading=False):
         stamp_ns, kind, index = event

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from filter_drives import lasting
 
 from sfa_localization.data.error_correlation import LEAST_M, ErrorCorrelation
 from sfa_localization.data.errors import DataError
@@ -14,18 +15,13 @@ from sfa_localization.data.errors import DataError
 def made(share, distance, seed=0, step=0.1, stretches=60, length=80):
     """Errors (M, 2) of 0.2 m with variances (M,), way (M,) and stretch (M,)."""
     rng = np.random.default_rng(seed)
-    fade = math.exp(-step / distance)
-    errors = []
-    for _ in range(stretches):
-        lasting = rng.standard_normal(2)
-        for _ in range(length):
-            lasting = fade * lasting + math.sqrt(1 - fade**2) * rng.standard_normal(2)
-            white = math.sqrt(1 - share) * rng.standard_normal(2)
-            errors.append(math.sqrt(share) * lasting + white)
-    count = len(errors)
+    fades = np.where(np.arange(stretches * length) % length, math.exp(-step / distance), 0.0)
+    count = len(fades)
+    errors = math.sqrt(share) * lasting(rng, fades, 2)
+    errors += math.sqrt(1 - share) * rng.standard_normal(errors.shape)
     std = rng.uniform(0.1, 0.3, count)
     owner = np.repeat(np.arange(stretches), length)
-    return np.array(errors) * std[:, None], std**2, np.arange(count) * step, owner
+    return errors * std[:, None], std**2, np.arange(count) * step, owner
 
 
 @pytest.mark.parametrize(('share', 'distance'), [(0.3, 1.0), (0.7, 0.3), (0.9, 2.0)])

@@ -84,14 +84,13 @@ def test_it_is_worst_where_the_images_mislead(monkeypatch):
     assert error > 1.5 * result.forecast.expected_m
 
 
-@pytest.mark.parametrize(('noise', 'yaw_noise'), [(3.0, 0.01), (2.0, 0.1)])
-def test_a_map_of_weak_images_keeps_the_shape_of_its_odometry_and_says_how_weak(noise, yaw_noise):
+def test_a_map_of_weak_images_keeps_the_shape_of_its_odometry_and_says_how_weak():
     """Features that hold little of the place, and noise that neighboring images share."""
     twists, start = criss_cross(8, half=(5.5, 5.5), seed=1, shortest=5.0)
-    run = drive(twists, start=start, bias=1.4e-3, yaw_noise=yaw_noise, speed_noise=0.03, seed=5)
+    run = drive(twists, start=start, bias=1.4e-3, yaw_noise=0.1, speed_noise=0.03, seed=5)
     truth, rng = run.poses[:, :2], np.random.default_rng(0)
     noises = gaussian_filter1d(rng.normal(size=(2, len(truth), 12)), 5, axis=1)
-    first, again = garden_features(truth) + noise * noises / noises.std()
+    first, again = garden_features(truth) + 2.0 * noises / noises.std()
     segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
     with pytest.MonkeyPatch.context() as patch:
         quick_and_tolerant(patch)

@@ -12,7 +12,6 @@ from filter_drives import FilterDrive
 
 from sfa_localization import tuning
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import Odometry, Trajectory
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
@@ -78,28 +77,16 @@ def test_the_error_is_measured_after_alignment_and_the_models_error_correlation_
 
 
 def test_images_that_are_stamped_late_are_no_noise_and_unusable_ones_do_not_count():
-    """Training and turns of the images show the delay in a trial as they do live."""
+    """Turns of the images show the delay in a trial as they do live."""
     plain, config = tuning_drive(claimed=0.05, true=0.02), FilterConfig()
     late = [replace(image, stamp_ns=image.stamp_ns + 300_000_000) for image in plain.observations]
     by_turns = replace(plain, observations=late)
     unturned = replace(plain, observations=[replace(image, turned=math.nan) for image in late])
-    by_training = replace(unturned, filter_for=late_filter)
-    drives = plain, by_training, by_turns, unturned
-    costs = [tuning.likelihood_cost([each], config) for each in drives]
-    errors = [tuning.error_cost([each], config) for each in drives]
     # Without turns the filter learns the delay from the way alone, later.
-    assert costs[1] == pytest.approx(costs[0]) and costs[1] < costs[3]
-    assert errors[1] < 1.2 * errors[0] and errors[2] < 0.5 * errors[3], errors
+    assert tuning.error_cost([by_turns], config) < 0.5 * tuning.error_cost([unturned], config)
     unusable = {'problem': 'dark', 'covariance': unusable_covariance()}
     dark = [replace(image, **unusable, stamp_ns=image.stamp_ns + 1) for image in plain.observations]
     images = sorted([*plain.observations, *dark], key=lambda image: image.stamp_ns)
     with_dark = replace(plain, observations=images)
     for cost in (tuning.likelihood_cost, tuning.error_cost):
         assert cost([with_dark], config) == pytest.approx(cost([plain], config))
-
-
-def late_filter(config):
-    """A filter whose model was trained with a camera that is 0.3 s late."""
-    fused = PoseFilter(config)
-    fused.expect(Rig(camera_delay=Quantity(0.3, 0.2)))
-    return fused
