@@ -93,6 +93,14 @@ def test_memory_does_not_grow_with_a_bag(name, tmp_path, messages):
     assert peak(4_000) < 1.1 * peak(1_000) + 33_000
 
 
+@pytest.mark.parametrize('name', ['version 9', 'lone db3', 'lone mcap'])
+def test_quality_of_service_is_kept(name, tmp_path, messages):
+    with Bag(FORMATS[name](tmp_path / 'bag', messages)) as bag:
+        (qos,) = bag.topics['/odom'].qos
+    parts = qos.depth, qos.reliability.name, qos.durability.name
+    assert parts == (7, 'BEST_EFFORT', 'TRANSIENT_LOCAL')
+
+
 def test_silence_of_a_library_is_an_error(tmp_path, messages, monkeypatch):
     """As rosbags 0.11 reads nothing where metadata and file spell a type differently."""
     path = FORMATS['other text in the metadata'](tmp_path / 'bag', messages)
