@@ -31,8 +31,8 @@ reproduce: $(READY)  ## the tables and figures of test/EVALUATION.md: hours, whi
 study: $(READY)  ## one of these studies, a year, or half-real bags (ARGS='baselines --quick'; ARGS=--help)
 	PYTHONPATH=.:test $(PY) -m study $(ARGS)
 
-test: $(READY)  ## run all tests, several files at once (ARGS='-k bag' for some of them)
-	$(PY) -m pytest $(PARALLEL) $(ARGS)
+test: $(READY)  ## run the tests, several files at once (ARGS='-k bag' for some of them, '-m study' for those of the studies)
+	$(PY) -m pytest $(PARALLEL) -m 'not study' $(ARGS)
 
 robustness: $(READY)  ## run the tests of faults, write their tables, replay a drive with each fault (25 minutes)
 	PYTHONPATH=.:test $(PY) -m robustness --page

@@ -15,7 +15,7 @@ WORSE = 1.25
 """An error may be this many times the recorded one: other processors round otherwise."""
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize('name', ['simulator', 'robot'])
 def test_the_quick_results_are_as_accurate_as_recorded(name, tmp_path):
     """After an improvement, record its figures: `study NAME --quick`, NAME.json, `columns`."""

@@ -58,7 +58,7 @@ def made_in(out):
         assert studies.main([name, '--quick', '--out', str(out / folder)]) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_comparisons_judge_every_recipe_alike(made):
     baselines = {cell['features']: cell for cell in cells(made / 'paper' / 'baselines.json')}
     assert all(0 < baselines[name]['test'] < 6 for name in BASELINES)
@@ -70,7 +70,7 @@ def test_comparisons_judge_every_recipe_alike(made):
     assert 'rows' in ablations['four layers']['problem'], 'these images are too small for it'
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_lights_and_months_are_judged_before_anything_is_learned(made):
     matrix = cells(made / 'light' / 'matrix.json')
     assert [cell['trained'] for cell in matrix] == ['day'] * 2 + ['day + overcast'] * 2
@@ -84,7 +84,7 @@ def test_lights_and_months_are_judged_before_anything_is_learned(made):
     assert models == {'frozen', 'updated', 'retrained'}
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_what_is_finished_is_not_made_again(made, monkeypatch, capsys):
     for module, step in ((results, 'simulate'), (light, 'evaluate'), (year, 'evaluate'),
                          (comparisons, 'evaluate')):  # fmt: skip
