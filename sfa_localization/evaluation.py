@@ -45,7 +45,8 @@ from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
-from sfa_localization.localizer import Localizer, Observation, Observer
+from sfa_localization.localizer import Localizer
+from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 

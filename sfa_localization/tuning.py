@@ -29,7 +29,8 @@ from sfa_localization.evaluation import observed
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Update
 from sfa_localization.fusion.replay import replay
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.localizer import Observation, Observer, filter_of
+from sfa_localization.localizer import filter_of
+from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 

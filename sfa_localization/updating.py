@@ -37,7 +37,8 @@ from sfa_localization.fusion.status import Level
 from sfa_localization.keyframes.keyframes import Keyframes, encoded
 from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.keyframes.training import fit_among
-from sfa_localization.localizer import Observation, Observer, filter_of
+from sfa_localization.localizer import filter_of
+from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 
 MOST_ADDED = 1000

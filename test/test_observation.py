@@ -18,7 +18,8 @@ from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.keyframes.errors import ErrorModel
 from sfa_localization.keyframes.light import Conditions
 from sfa_localization.keyframes.location import located
-from sfa_localization.localizer import Localizer, Observer, unusable_covariance
+from sfa_localization.localizer import Localizer
+from sfa_localization.observer import Observer, unusable_covariance
 from sfa_localization.place_model import PlaceModel
 
 

@@ -15,7 +15,7 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.run import Odometry, Trajectory
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.localizer import Observation, unusable_covariance
+from sfa_localization.observer import Observation, unusable_covariance
 from sfa_localization.tuning import TuningDrive
 
 

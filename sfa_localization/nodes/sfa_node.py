@@ -20,12 +20,12 @@ from sfa_localization.camera.watch import EXPLAINED_WARNING
 from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.camera_clock import NEAR_NS
-from sfa_localization.localizer import Observation, Observer
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.discovery import Discovery
 from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, sensor_qos
 from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import SfaNodeConfig
+from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 
 _FEATURE_FRAME, _TURNED_FRAME = 'slow_feature_space', 'first_image'

@@ -19,7 +19,7 @@ from sfa_localization.bags.drives import as_live, read_drive
 from sfa_localization.data.geometry import compose, relative
 from sfa_localization.data.run import Trajectory
 from sfa_localization.evaluation import fit_transform
-from sfa_localization.localizer import Observer
+from sfa_localization.observer import Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe, train
 

@@ -11,7 +11,8 @@ from robustness.messages import Picture, Reading, Restart
 from robustness.recorded import model, to_truth
 from sfa_localization.camera.encodings import read_compressed
 from sfa_localization.data.errors import CameraError, ModelError
-from sfa_localization.localizer import Localizer, Observation, Observer
+from sfa_localization.localizer import Localizer
+from sfa_localization.observer import Observation, Observer
 
 
 class Robot:

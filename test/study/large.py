@@ -20,7 +20,8 @@ from sfa_localization.data.run import Run, Trajectory
 from sfa_localization.evaluation import moved, observed, score
 from sfa_localization.fusion.pose_filter import Level
 from sfa_localization.keyframes.observation import Observation
-from sfa_localization.localizer import Localizer, Observer
+from sfa_localization.localizer import Localizer
+from sfa_localization.observer import Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import Recipe, train
