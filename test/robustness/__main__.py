@@ -10,10 +10,11 @@ import argparse
 import os
 import sys
 import tempfile
+from pathlib import Path
 
 from page_tables import write_table
 
-from robustness import frozen, promises
+from robustness import frozen, promises, troubles
 from robustness.faults import FAULTS, LIES
 from robustness.judged import errors_table, head, judge, row, states_table, summary
 from robustness.recorded import OTHER_LIGHTS, two_laps
@@ -50,6 +51,16 @@ def tell(text):
     sys.stdout.flush()
 
 
+def tell_troubles(names):
+    """Print a row for each trouble of a recorded drive; 1 if any is not as it should be."""
+    wrong = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, errors, said, right in troubles.table(Path(folder), names):
+            tell(f'{name:32} {errors:16} {said}{"" if right else "   <- WRONG"}')
+            wrong += [] if right else [name]
+    return bool(wrong)
+
+
 def ways(options):
     """Titles, and what gives the outputs of a fault by name."""
 
@@ -80,6 +91,7 @@ def main():
         ('--lights', 'also in other lights and seasons'),
         ('--frozen', 'the filter alone, by day and in the evening; writes test/README.md'),
         ('--means', 'the same; keep the mean errors, which test_faults.py lets get no worse'),
+        ('--troubles', 'instead the troubles of recorded drives, with training: half an hour'),
         ('--page', 'only write the faults of promises.py into test/README.md'),
         ('--record', 'locate all images anew: after training, features or keyframes change'),
     ):
@@ -91,6 +103,8 @@ def main():
     if options.record:
         frozen.record(tell)
         return 0
+    if options.troubles:
+        return tell_troubles(options.faults)
     lies = [*LIES] if options.frozen or options.means else []
     results = {
         title: judged(title, options.faults or [*FAULTS, *lies], outputs_of)
