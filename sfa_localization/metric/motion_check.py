@@ -24,6 +24,7 @@ from sfa_localization.data.odometry_steps import JUMP, NOISE
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
 from sfa_localization.metric.breaks import StampedTextures, contradicted, parted
+from sfa_localization.metric.motion_gyro import cleaned, is_worse
 from sfa_localization.metric.motion_sources import (
     ENOUGH,
     EQUAL,
@@ -141,10 +142,8 @@ def check_motion(
     impossible = list(_impossible(sources_of(odometry, images, gyro)))
     check = MotionCheck([], odometry, gyro, list(impossible))
     if not impossible:
-        for change in parted, _straightened:
-            check.odometry, text = change(check.odometry)
-            check.corrected += [text] if text else []
-    sources = sources_of(check.odometry, images, gyro)
+        _correct_samples(check, images)
+    sources = sources_of(check.odometry, images, check.gyro)
     pairs = [compare(a, b, what) for what in ('turns', 'way') for a, b in combinations(sources, 2)]
     check.pairs = [pair for pair in pairs if pair]
     turns = check.pair(POSE, IMAGES)
@@ -155,6 +154,7 @@ def check_motion(
         _judge_axes(check)
         _judge(check, 'turns')
         _judge_clocks(check)
+        _judge_gyro(check, images)
         if views is not None:
             late_ns = round(turns.late_s * 1e9) if turns else 0
             check.odometry, texts = contradicted(check.odometry, views[0] - late_ns, views[1])
@@ -165,6 +165,15 @@ def check_motion(
         check.notes += [text for text in check.wrong if text.startswith('images')]
         check.wrong = [text for text in check.wrong if not text.startswith('images')]
     return check
+
+
+def _correct_samples(check: MotionCheck, images: tuple[Stamps, Array] | None) -> None:
+    """Correct jumps and heading of the odometry, and leave out faulty samples."""
+    for change in parted, _straightened:
+        check.odometry, text = change(check.odometry)
+        check.corrected += [text] if text else []
+    check.gyro, text = cleaned(check.odometry, images, check.gyro)
+    check.corrected += [text] if text else []
 
 
 def _impossible(sources: Sequence[Source]) -> Iterator[str]:
@@ -332,3 +341,10 @@ def _judge_clocks(check: MotionCheck) -> None:
         if name == GYRO and check.gyro is not None:
             check.gyro = replace(check.gyro, stamps_ns=check.gyro.stamps_ns - late_ns)
         check.corrected.append(f'{name}: stamped {late(pair.late_s)}; taken into account')
+
+
+def _judge_gyro(check: MotionCheck, images: tuple[Stamps, Array] | None) -> None:
+    """Leave out a gyroscope that is worse than none."""
+    if is_worse(check.odometry, images, check.gyro):
+        check.corrected.append(f'{GYRO}: left out: the wheels agree better with the images')
+        check.gyro = None
