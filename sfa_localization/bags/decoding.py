@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from sfa_localization.bags.files import Topic
 from sfa_localization.camera.encodings import read_compressed, read_raw
 from sfa_localization.data.errors import BagError, MessageError
-from sfa_localization.data.messages import read_planar, read_twist, require_sane
+from sfa_localization.data.messages import read_odometry, read_planar, require_sane
 from sfa_localization.data.run import Image
 
 IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
@@ -87,5 +87,10 @@ def place_of(message: Any) -> tuple[float, float, float]:
 
 
 def odometry_of(message: Any) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
-    """Pose, and of an Odometry v, omega and their variances; other types have no twist."""
-    return pose_of(message), read_twist(message) if message.__msgtype__ == ODOMETRY else None
+    """Pose, NaN where an Odometry is not filled with one, and of an Odometry v, omega and their
+    variances; other types have no twist.
+    """
+    if message.__msgtype__ != ODOMETRY:
+        return pose_of(message), None
+    pose, twist = read_odometry(message)
+    return pose or (math.nan,) * 3, twist

@@ -119,6 +119,28 @@ def lost(m, rng, share=0.05):
         m.pose.orientation = type(m.pose.orientation)(0.0, 0.0, 0.0, 1.0)
 
 
+def wrong_rate(share, value):
+    """A gyroscope of which a share of the messages reports another rate, rad/s."""
+
+    def change(m, rng):
+        if rng.random() < share:
+            m.angular_velocity.z = value * rng.choice([-1.0, 1.0])
+
+    return change
+
+
+def held_rate(period_s=4.0, share=0.25):
+    """A gyroscope that repeats a rate for a share of each period."""
+    last = [0.0]
+
+    def change(m, _):
+        if stamp_of(m) * 1e-9 % period_s < share * period_s:
+            m.angular_velocity.z = last[0]
+        last[0] = m.angular_velocity.z
+
+    return change
+
+
 RIGHT_M = 0.055, 0.055
 """One image and filter of the untouched drive err by 0.042 m: a trouble that is mended adds a
 little."""
@@ -129,6 +151,18 @@ TROUBLES = {
     'truth: 0.3 s late': Trouble(
         lambda: {TRUTH: lambda m, _: restamp(m, stamp_of(m) + 300_000_000)},
         RIGHT_M, 'ground truth.* 0.30 s late', trains=False,
+    ),
+    'gyroscope: 20 % zeros': Trouble(
+        lambda: {IMU: wrong_rate(0.2, 0.0)}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
+    ),
+    'gyroscope: 1 % spikes': Trouble(
+        lambda: {IMU: wrong_rate(0.01, 30.0)}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
+    ),
+    'gyroscope: held': Trouble(
+        lambda: {IMU: held_rate()}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
+    ),
+    'gyroscope: half of it zeros': Trouble(
+        lambda: {IMU: wrong_rate(0.5, 0.0)}, RIGHT_M, 'gyroscope: left out: the wheels agree better'
     ),
 }  # fmt: skip
 
