@@ -50,7 +50,7 @@ WHEELS = 1.02
 
 def points(places):
     """Points at places (K,), known to STD."""
-    return Points.of([(f'point {k}', k, complex(at), STD) for k, at in enumerate(places)])
+    return Points.of([(f'point {k}', k, complex(at), STD, 0j) for k, at in enumerate(places)])
 
 
 def settled(measured, places, std=0.02):
@@ -129,7 +129,9 @@ def measured_at(rows, wrong=None):
     places = places + STD * (rng.standard_normal(len(rows)) + 1j * rng.standard_normal(len(rows)))
     places[[] if wrong is None else [wrong]] += 2.0
     stamps = run.stamps_ns[rows].tolist()
-    return Points.of([(f'point {k}', stamps[k], at, STD) for k, at in enumerate(places.tolist())])
+    return Points.of(
+        [(f'point {k}', stamps[k], at, STD, 0j) for k, at in enumerate(places.tolist())]
+    )
 
 
 def drive_of(run, odometry):
@@ -218,7 +220,7 @@ def test_points_bend_a_route_straight():
     item = drive_of(run, run.odometry)
     rows, config = np.linspace(5, len(run.poses) - 6, 8).astype(int), SegmentConfig()
     given = Points.of([
-        (str(k), int(run.stamps_ns[row]), complex(*run.poses[row, :2]), STD)
+        (str(k), int(run.stamps_ns[row]), complex(*run.poses[row, :2]), STD, 0j)
         for k, row in enumerate(rows.tolist())
     ])  # fmt: skip
     missed = []

@@ -48,7 +48,9 @@ KINDS = {
     'odometry': Kind('odometry', '--odom-topic', (decoding.ODOMETRY,), decoding.POSES),
     'imu': Kind('yaw rates', '--imu-topic', (decoding.IMU,), (decoding.IMU,)),
     'points_topic': Kind('measured places', '--points-topic', decoding.PLACES, decoding.PLACES),
-    'ground_truth': Kind('true poses', '--ground-truth-topic', _TRUTH, decoding.POSES),
+    'ground_truth': Kind(
+        'true poses', '--ground-truth-topic', _TRUTH, (*decoding.POSES, decoding.FIX)
+    ),
 }
 
 

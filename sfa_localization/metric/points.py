@@ -83,7 +83,7 @@ def read_points(path: Path, odometry: Odometry) -> Points:
                 f'for {STOP_S:g} s; inspect lists them'
             )
         name = f'stop {stop}' if stop else f'point of {cells[0]} s'
-        rows.append((name, int(stood[stop - 1]) if stop else stamp_ns, complex(x, y), std))
+        rows.append((name, int(stood[stop - 1]) if stop else stamp_ns, complex(x, y), std, 0j))
     if not rows:
         raise DataError(f'{path}: holds no points: {_USAGE}')
     return Points.of(rows)
