@@ -37,7 +37,7 @@ def fix_of(message: Any) -> tuple[float, float, float]:
 
 def in_plane(fixes: StampedValues, origin: Origin) -> StampedValues:
     """The values latitude, longitude, third as x, y m and the third."""
-    return [(at, (*east_north(*fix[:2], origin), *fix[2:])) for at, fix in fixes]
+    return [(at, (*east_north(fix[0], fix[1], origin), *fix[2:])) for at, fix in fixes]
 
 
 def east_north(latitude: float, longitude: float, origin: Origin) -> tuple[float, float]:
