@@ -170,7 +170,7 @@ class BagReport:
             facts['images'] = str(self.camera)
         if self.odometry is not None:
             facts['drive'] = (
-                f'{path_length(self.odometry.poses):.0f} m by {self.odometry_topic}, '
+                f'{sum(map(path_length, _parts(self.odometry))):.0f} m by {self.odometry_topic}, '
                 f'{len(self.places)} images over {hull_area(self.places):.0f} m2, '
                 f'{spacing(self.places):.2f} m apart, '
                 f'along {directions(self.places)} of {SECTORS} directions'
