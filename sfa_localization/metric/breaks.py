@@ -120,8 +120,8 @@ def _goes_on_elsewhere(odometry: Odometry, pause: Mask, step: Array) -> str:
     times, most = ('once', '') if len(rows) == 1 else (f'{len(rows)} times', 'up to ')
     first_s = (odometry.stamps_ns[rows[0]] - odometry.stamps_ns[0]) * 1e-9
     return (
-        f'odometry pauses {times}, first after {first_s:.1f} s, and goes on {most}{far.max():.2f} m '
-        'from where it was: cut there'
+        f'odometry pauses {times}, first after {first_s:.1f} s, and goes on {most}{far.max():.2f} '
+        'm from where it was: cut there'
     )
 
 
