@@ -198,8 +198,3 @@ def read_raw(message: Any) -> Image:
     """Image (H, W, 3) uint8 BGR of a ``sensor_msgs/Image``. Raises CameraError."""
     size = message.height, message.width, message.step
     return decode_image(message.data, *size, message.encoding, bool(message.is_bigendian))
-
-
-def read_compressed(message: Any) -> Image:
-    """Image (H, W, 3) uint8 BGR of a ``sensor_msgs/CompressedImage``. Raises CameraError."""
-    return decode_compressed(message.data, message.format)
