@@ -29,6 +29,7 @@ from sfa_localization.keyframes.location import Location, hypotheses, located
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE, Observation
 from sfa_localization.keyframes.regression import Fit
 from sfa_localization.keyframes.upright import UprightImage, upright
+from sfa_localization.metric.driven_ground import DrivenGround
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.turned_maps import TurnedMaps
 from sfa_localization.sfa.image_features import (
@@ -47,7 +48,7 @@ from sfa_localization.sfa.network import (
 )
 
 FORMAT = 'sfa_localization place model'
-VERSION = 15
+VERSION = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +67,9 @@ class PlaceModel:
     """Network, metric map and keyframes, learned from one place.
 
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the figures
-    of merit of the training, `error_correlation` that of neighboring images, `rig` the robot. Map
-    and keyframes hold places of the camera. The map reads `turned` maps, or slow features where
-    there are none.
+    of merit of the training, `error_correlation` that of neighboring images, `rig` the robot, and
+    `ground` where it drove. Map and keyframes hold places of the camera. The map reads `turned`
+    maps, or slow features where there are none.
     """
 
     network: Network
@@ -79,6 +80,7 @@ class PlaceModel:
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
     rig: Rig = field(default_factory=Rig)
+    ground: DrivenGround = field(default_factory=DrivenGround)
 
     def locate(self, panorama: Image) -> Observation:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
@@ -194,6 +196,7 @@ class PlaceModel:
             arrays |= _prefixed(f'network/{depth}/', {**parts, 'delta': self.network.deltas[depth]})
         arrays |= _prefixed('metric/', self.metric.to_arrays())
         arrays |= _prefixed('keyframes/', self.keyframes.to_arrays())
+        arrays |= _prefixed('ground/', self.ground.to_arrays())
         if self.turned is not None:
             arrays |= _prefixed('turned/', self.turned.to_arrays())
         return arrays
@@ -211,6 +214,7 @@ class PlaceModel:
             header['quality'],
             ErrorCorrelation(**header['error_correlation']),
             Rig.from_mapping(header['rig']),
+            DrivenGround.from_arrays(_under(arrays, 'ground/')),
         )
 
 
