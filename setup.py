@@ -19,6 +19,7 @@ COMMANDS = (
     'inspect',
     'calibrate',
     'filter',
+    'map',
     'tune',
     'config',
     'demo',

@@ -76,11 +76,11 @@ class PlaceModel:
     metric: MetricMap
     panorama: PanoramaConfig
     keyframes: Keyframes
+    ground: DrivenGround
     turned: TurnedMaps | None = None
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
     rig: Rig = field(default_factory=Rig)
-    ground: DrivenGround = field(default_factory=DrivenGround)
 
     def locate(self, panorama: Image) -> Observation:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
@@ -210,11 +210,11 @@ class PlaceModel:
             MetricMap.from_arrays(_under(arrays, 'metric/')),
             panorama,
             Keyframes.from_arrays(_under(arrays, 'keyframes/'), panorama.sphere),
+            DrivenGround.from_arrays(_under(arrays, 'ground/')),
             TurnedMaps.from_arrays(turned) if turned else None,
             header['quality'],
             ErrorCorrelation(**header['error_correlation']),
             Rig.from_mapping(header['rig']),
-            DrivenGround.from_arrays(_under(arrays, 'ground/')),
         )
 
 

@@ -141,10 +141,10 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         result.map,
         given.panorama,
         keyframe_map.keyframes,
+        DrivenGround.of(rig.centers(result.poses), drive, result.forecast.local),
         turned,
         quality,
         keyframe_map.correlation,
         rig,
-        DrivenGround.of(rig.centers(result.poses), drive, result.forecast.local),
     )
     return Trained(model, given.runs, images.slow, segments, result)

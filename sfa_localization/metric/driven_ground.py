@@ -7,7 +7,7 @@ and to plan on.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sfa_localization.data.geometry import Array, Indices, Mask
+from sfa_localization.metric.settings import GroundConfig
 
 # Images farther from the one before are drawn apart: the drive between them is not in the map.
 _JOINED_M = 1.0
@@ -37,9 +38,9 @@ class DrivenGround:
     the robot drove there from the place before; `expected_m` (P,) is the error of one image.
     """
 
-    places: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    joined: Mask = field(default_factory=lambda: np.zeros(0, bool))
-    expected_m: Array = field(default_factory=lambda: np.zeros(0))
+    places: Array
+    joined: Mask
+    expected_m: Array
 
     @classmethod
     def of(cls, places: Array, drive: Indices, expected_m: Array) -> DrivenGround:
@@ -53,20 +54,18 @@ class DrivenGround:
         ends = np.flatnonzero(self.joined)
         return np.column_stack([ends - 1, ends])
 
-    def cells(self, width_m: float, size_m: float) -> Cells:
-        """Cells of `size_m` within half of `width_m` of where the robot drove."""
-        ends = self.places[self.lines]
-        steps = int(np.ceil(_JOINED_M / size_m)) + 1
-        part = np.linspace(0.0, 1.0, steps)[:, None]
-        points = (ends[:, :1] + part * (ends[:, 1:] - ends[:, :1])).reshape(-1, 2)
-        points = np.concatenate([self.places, points])
-        corner = np.floor(points.min(0) / size_m - width_m / 2 / size_m) * size_m
+    def cells(self, config: GroundConfig) -> Cells:
+        """The cells that a robot of some width covered."""
+        size_m, reach_m, ends = config.cell, config.width / 2, self.places[self.lines]
+        part = np.linspace(0.0, 1.0, int(np.ceil(_JOINED_M / size_m)) + 1)[:, None]
+        between = ends[:, :1] + part * (ends[:, 1:] - ends[:, :1])
+        points = np.concatenate([self.places, between.reshape(-1, 2)])
+        margin = int(np.ceil(reach_m / size_m)) + 1
+        corner = (np.floor(points.min(0) / size_m) - margin) * size_m
         column, row = np.floor((points - corner) / size_m).astype(int).T
-        margin = int(np.ceil(width_m / 2 / size_m)) + 1
-        empty = np.ones((row.max() + 1 + margin, column.max() + 1 + margin), bool)
-        empty[row, column] = False
-        distance_m = ndimage.distance_transform_edt(empty) * size_m
-        return Cells(distance_m <= width_m / 2, corner, size_m)
+        away = np.ones((row.max() + margin + 1, column.max() + margin + 1), bool)
+        away[row, column] = False
+        return Cells(ndimage.distance_transform_edt(away) * size_m <= reach_m, corner, size_m)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to save."""
