@@ -65,7 +65,7 @@ format: $(READY)  ## sort imports and format the code with ruff
 colcon:  ## colcon build and colcon test in a clean environment
 	PYTHON='$(PYTHON)' sh .ci/colcon $(PARALLEL) $(ARGS)
 
-matrix:  ## the tests on NumPy 1.26 with Python 3.12, and on the newest NumPy and Python
+matrix:  ## the tests on NumPy 1.26 with Python 3.12, on the newest NumPy and Python, and with ROS 2 Kilted
 	sh .ci/matrix $(ARGS)
 
 clean:  ## remove build results, but not the environment
