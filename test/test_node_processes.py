@@ -54,8 +54,8 @@ def ended(process):
 
 
 def test_what_rclpy_cannot_handle_itself_ends_nothing(bench, start):
-    """A negative clock, a parameter of an unknown type, and a transition that does not fit, which the
-    rclpy of Kilted answers.
+    """Parameters of an unknown type, a negative clock, and transitions that do not fit: the rclpy of
+    Kilted answers the last.
     """
     answers, process = [], start('ekf_node', '-p', 'use_sim_time:=true')
     for kind, service, request in (
