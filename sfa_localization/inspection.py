@@ -21,7 +21,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 from sfa_localization.bags import decoding
 from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S
 from sfa_localization.bags.motion_arrays import to_yaw_rate
-from sfa_localization.bags.reader import KINDS, Bag
+from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera import kinds
@@ -319,18 +319,16 @@ class _Survey:
             return self._bag.stream(name, self._take, required=False)
         if name == self._imu:
             return self._bag.stream(name, self._yaw_rate, required=False)
-        is_image = self._bag.topics[name].kind in KINDS['image'].usual
         # Other images are decoded to detect damage, and not kept.
-        check = (lambda m: decoding.image_of(m).shape) if is_image else (lambda _: None)
-        return self._bag.stream(name, check, required=False)
+        return self._bag.stream(name, lambda _: None, required=False)
 
-    def _take(self, message: Any) -> tuple[float, NDArray[np.int8] | None]:
-        """Decode an image, and keep a sample now and then.
+    def _take(self, image: Image) -> tuple[float, NDArray[np.int8] | None]:
+        """Keep a sample of the images now and then.
 
         Returns the turn of the camera since the first image, rad, and a small texture of the image,
         None if it repeats the last one.
         """
-        image, samples = decoding.image_of(message), self._report.samples
+        samples = self._report.samples
         new = self._frozen.add(image)
         self._repeats += not new
         if self._sizes.total() % self._every == 0 and len(samples) < SAMPLES:

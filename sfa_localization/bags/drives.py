@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,9 +202,8 @@ class _PanoramaFile:
         self.stamps: list[int] = []
         self._shape: tuple[int, ...] = ()
 
-    def panorama(self, message: Any) -> Image:
-        """The panorama of a message. Raises LocalizationError."""
-        image = decoding.image_of(message)
+    def panorama(self, image: Image) -> Image:
+        """The panorama of a camera's image. Raises LocalizationError."""
         if not looks_like_panorama(*image.shape[:2]):
             image = self._unwrap(image)
         if self._watch is not None and not self._watch.add(image):
