@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores
 
 from sfa_localization.bags.decoding import typestore
+from sfa_localization.camera.encodings import decode_compressed
 
 TRAINING, TEST = Path('bags/sample'), Path('bags/sample_test')
 IMAGES, ODOMETRY, IMU, TRUTH = '/panorama/compressed', '/odom', '/imu', '/ground_truth'
@@ -119,6 +121,30 @@ def lost(m, rng, share=0.05):
         m.pose.orientation = type(m.pose.orientation)(0.0, 0.0, 0.0, 1.0)
 
 
+def cut_off(m, rng, share=0.125):
+    """A camera that loses bytes in the middle of some JPEGs."""
+    if rng.random() < share:
+        first = int(len(m.data) * rng.uniform(0.25, 0.6))
+        m.data = np.delete(m.data, slice(first, first + len(m.data) // 4))
+
+
+def as_video(key_every=30):
+    """A driver that publishes H.264, with a key frame every few images."""
+    import av
+
+    encoder = av.CodecContext.create('libx264', 'w')
+    encoder.options = {'tune': 'zerolatency', 'crf': '18', 'g': str(key_every)}
+    encoder.pix_fmt, encoder.time_base = 'yuv420p', Fraction(1, 10)
+    encoder.width, encoder.height = 600, 60
+
+    def encode(m, _):
+        frame = av.VideoFrame.from_ndarray(decode_compressed(m.data), format='bgr24')
+        packets = encoder.encode(frame.reformat(format='yuv420p'))
+        m.format, m.data = 'h264', np.frombuffer(b''.join(map(bytes, packets)), np.uint8)
+
+    return encode
+
+
 RIGHT_M = 0.055, 0.055
 """One image and filter of the untouched drive err by 0.042 m: a trouble that is mended adds a
 little."""
@@ -130,6 +156,10 @@ TROUBLES = {
         lambda: {TRUTH: lambda m, _: restamp(m, stamp_of(m) + 300_000_000)},
         RIGHT_M, 'ground truth.* 0.30 s late', trains=False,
     ),
+    'images: JPEGs cut off': Trouble(
+        lambda: {IMAGES: cut_off}, RIGHT_M, 'images: .* cut-off JPEG'
+    ),
+    'images: H.264': Trouble(lambda: {IMAGES: as_video()}, RIGHT_M, 'images: 140 used'),
 }  # fmt: skip
 
 
