@@ -93,13 +93,14 @@ def test_wrong_pictures_are_refused_with_the_reason():
     good = {'data': b'1' * 144, 'height': 6, 'width': 8, 'step': 24, 'encoding': 'bgr8'}
     for change, reason in (
         ({'encoding': 'hsv9'}, 'unsupported encoding'), ({'width': 0}, 'empty'),
-        ({'step': 0}, 'empty'), ({'data': b'1' * 143}, 'data size'),
+        ({'step': 0, 'width': 7}, 'step is 0'), ({'data': b'1' * 143}, 'data size'),
         ({'data': b'1' * 145}, 'data size'), ({'height': 2**63}, 'data size'),
         ({'width': 9}, 'step is shorter'),
         ({'encoding': 'yuv422', 'width': 7, 'step': 24}, 'unusable'),
     ):  # fmt: skip
         with pytest.raises(CameraError, match=reason):
             decode_image(**{**good, **change})
+    np.testing.assert_array_equal(decode_image(**{**good, 'step': 0}), decode_image(**good))
 
 
 def test_no_encoding_dies_of_a_tiny_or_odd_picture():

@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from sfa_localization.bags.files import Topic
+from sfa_localization.bags.satellite_fixes import fix_of
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.messages import read_planar, read_twist, require_sane
 
@@ -31,7 +32,8 @@ STAMPED_POSES = (
 )
 POSES = (ODOMETRY, *STAMPED_POSES, TF)
 """Types with a pose of the robot."""
-PLACES = (*STAMPED_POSES[:2], 'geometry_msgs/msg/PointStamped')
+FIX = 'sensor_msgs/msg/NavSatFix'
+PLACES = (*STAMPED_POSES[:2], 'geometry_msgs/msg/PointStamped', FIX)
 """Types with a measured point."""
 SERIALIZATIONS = {'cdr': Stores.ROS2_JAZZY, 'ros1': Stores.ROS1_NOETIC}
 """The standard types of each wire format."""
@@ -81,8 +83,12 @@ def transform_to(frame: str, message: Any, topic: str) -> Any:
 
 
 def pose_of(message: Any) -> tuple[float, float, float]:
-    """Planar pose x m, y m, yaw rad of a message or transform. Raises MessageError."""
+    """Planar pose x m, y m, yaw rad of a message or transform; latitude, longitude, 0 of a fix.
+    Raises MessageError.
+    """
     kind = message.__msgtype__
+    if kind == FIX:
+        return (*fix_of(message)[:2], 0.0)
     if kind == 'geometry_msgs/msg/TransformStamped':
         return read_planar(message.transform.translation, message.transform.rotation)
     pose = message.pose if kind == 'geometry_msgs/msg/PoseStamped' else message.pose.pose
@@ -90,8 +96,12 @@ def pose_of(message: Any) -> tuple[float, float, float]:
 
 
 def place_of(message: Any) -> tuple[float, float, float]:
-    """Place x m, y m and its standard deviation, 0 where unknown. Raises MessageError."""
+    """Place x m, y m, or latitude and longitude of a fix, and its standard deviation, m, 0 where
+    unknown. Raises MessageError.
+    """
     kind, variance = message.__msgtype__, 0.0
+    if kind == FIX:
+        return fix_of(message)
     if kind == 'geometry_msgs/msg/PointStamped':
         point = message.point
     elif kind == 'geometry_msgs/msg/PoseStamped':

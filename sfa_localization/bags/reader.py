@@ -19,6 +19,7 @@ from sfa_localization.bags import motion_arrays as motion
 from sfa_localization.bags.files import ZSTD_MAGIC, Record, Topic, add_problem, inflate_message
 from sfa_localization.bags.motion_arrays import StampedValues
 from sfa_localization.bags.recording import Recording
+from sfa_localization.bags.satellite_fixes import in_plane
 from sfa_localization.bags.settings import BagConfig
 from sfa_localization.bags.topic_stream import Item, Stream
 from sfa_localization.camera.video import ImageReader
@@ -49,7 +50,9 @@ KINDS = {
     'odometry': Kind('odometry', '--odom-topic', (decoding.ODOMETRY,), decoding.POSES),
     'imu': Kind('yaw rates', '--imu-topic', (decoding.IMU,), (decoding.IMU,)),
     'points_topic': Kind('measured places', '--points-topic', decoding.PLACES, decoding.PLACES),
-    'ground_truth': Kind('true poses', '--ground-truth-topic', _TRUTH, decoding.POSES),
+    'ground_truth': Kind(
+        'true poses', '--ground-truth-topic', _TRUTH, (*decoding.POSES, decoding.FIX)
+    ),
 }
 
 
@@ -132,7 +135,10 @@ class Bag:
     def trajectory(self, topic: str = '') -> Trajectory:
         """All poses of a topic, by default of the true poses."""
         stream = self.stream(self.find('ground_truth', topic), decoding.pose_of)
-        return motion.to_trajectory(list(self._values(stream)))
+        values = list(self._values(stream))
+        if self.topics[stream.topic].kind == decoding.FIX:
+            values = in_plane(values, values[0][1][:2])
+        return motion.to_trajectory(values)
 
     def _values(self, stream: Stream) -> Iterator[tuple[int, Any]]:
         return ((stamp_ns, value) for _, stamp_ns, value in self.read([stream]))

@@ -17,7 +17,7 @@ class TopicNames(Settings):
     odometry: str = setting('', 'wheel odometry: Odometry, or any pose when named')
     imu: str = setting('', 'yaw rate: Imu')
     points_topic: str = setting(
-        '', 'measured places: PoseWithCovarianceStamped, PoseStamped or PointStamped'
+        '', 'measured places: NavSatFix, PoseWithCovarianceStamped, PoseStamped or PointStamped'
     )
     ground_truth: str = setting('', 'true poses, read for evaluation only')
 

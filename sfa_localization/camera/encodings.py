@@ -73,18 +73,24 @@ def decode_image(
 ) -> Image:
     """Decode raw image data, as in ``sensor_msgs/Image``, to BGR (height, width, 3) uint8.
 
-    `data` is any buffer of bytes, `step` the bytes per row. The result may be a read-only view of
-    `data`. Raises CameraError with the reason in a few words.
+    `data` is any buffer of bytes, `step` the bytes per row: 0, as of drivers that leave it out,
+    where rows follow each other without a gap. The result may be a read-only view of `data`. Raises
+    CameraError with the reason in a few words.
     """
     layout = _LAYOUTS.get(encoding.lower())
     if layout is None:
         raise CameraError(f'unsupported encoding {encoding!r}')
-    if min(height, width, step) <= 0:
+    if min(height, width) <= 0 or step < 0:
         raise CameraError('empty image')
     buffer, rows = _bytes(data), height * layout.rows[0] // layout.rows[1]
+    used = width * layout.channels * layout.depth
+    if not step and buffer.size != rows * used:
+        raise CameraError(
+            f'step is 0, but a row has {used} bytes or more: the driver leaves it out'
+        )
+    step = step or used
     if buffer.size != rows * step:
         raise CameraError('data size is not rows times step')
-    used = width * layout.channels * layout.depth
     if step < used:
         raise CameraError('step is shorter than a row')
     pixels = buffer.reshape(rows, step)[:, :used]
