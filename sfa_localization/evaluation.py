@@ -112,6 +112,13 @@ class _Localized:
         """Poses of the usable images in the map."""
         return self.tracks['sfa'].poses
 
+    def estimates(self, transform: RigidTransform) -> dict[str, Trajectory]:
+        """Poses in the frame of the truth, without headings if the truth has none."""
+        poses = {'odometry': odometry_from_start(self.truth, self.run)}
+        poses |= {name: moved(track.poses, transform) for name, track in self.tracks.items()}
+        axes = [1.0, 1.0, 1.0 if self.true.headings else np.nan]
+        return {name: Trajectory(p.stamps_ns, p.poses * axes) for name, p in poses.items()}
+
 
 @one_core()
 def evaluate(
@@ -144,24 +151,15 @@ def evaluate(
     if transform is None:
         aligned_on = ', '.join(map(str, align_bags or [bag]))
         transform = fit_transform(*((d.truth, d.images) for d in training_drives or [drive]))
-    estimates = {'odometry': odometry_from_start(drive.truth, drive.run)}
-    estimates |= {name: moved(track.poses, transform) for name, track in drive.tracks.items()}
-    if not drive.true.headings:
-        estimates = {
-            name: Trajectory(estimate.stamps_ns, estimate.poses * [1.0, 1.0, np.nan])
-            for name, estimate in estimates.items()
-        }
+    estimates = drive.estimates(transform)
     scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
     turn = rotation(transform.yaw_rad)
     for name, track in drive.tracks.items():
         scores[name] |= calibration(drive.truth, estimates[name], turn, track.covariances)
         scores[name]['similarity'] = similarity(drive.truth, estimates[name])
     counts = {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])}
-    corrections = tuple(
-        f'{each.run.name}: {text}'
-        for each in (*training_drives, drive)
-        for text in each.true.sentences
-    )
+    drives = *training_drives, drive
+    corrections = tuple(f'{d.run.name}: {text}' for d in drives for text in d.true.sentences)
     return Evaluation(
         drive.truth, estimates, scores, counts, drive.features, aligned_on, transform, corrections
     )

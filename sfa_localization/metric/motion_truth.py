@@ -140,6 +140,30 @@ class _Windows:
         return np.asarray(values - direction[:, None] * shares[self.number])
 
 
+@dataclass(frozen=True, slots=True)
+class _Linear:
+    """Residuals (M,) m of samples, their derivatives `slopes` (M, 5) by -theta, and rotations (W,)
+    of the windows, with a mask of those in which the robot drove.
+    """
+
+    residual: Complex
+    slopes: Complex
+    turns: Complex
+    drove: Mask
+
+    def step(
+        self, theta: Array, free: Mask, windows: _Windows, weight: Array, variance: float
+    ) -> tuple[Array, Array]:
+        """The step (5,) of Gauss and Newton, and the covariance (5, 5) of theta."""
+        score = windows.sums(weight[:, None] * (self.residual[:, None] * self.slopes.conj()).real)
+        normal = ((weight[:, None] * self.slopes).conj().T @ self.slopes).real
+        prior, inverse, both = variance / _PRIOR**2, np.zeros((5, 5)), np.ix_(free, free)
+        inverse[both] = np.linalg.inv((normal + np.diag(prior))[both])
+        step = inverse @ (score.sum(0) - prior * theta * _PULLED)
+        covariance = inverse @ (score.T @ score + variance * normal) @ inverse
+        return np.clip(step, -0.5, 0.5), covariance
+
+
 class _Comparison:
     """Places of a truth, m, at N times in s, and the odometry of the drive."""
 
@@ -180,36 +204,30 @@ class _Comparison:
         rows = rows[(at >= self.track_s[0]) & (at <= self.track_s[-1])]
         if self.used[rows].sum() < 3 * WINDOWS_MIN:
             return None
-        way = np.interp(self.seconds[rows] - theta[2], self.track_s, self.way)
-        after = np.searchsorted(self.track_s, self.seconds[rows] - theta[2], 'right')
+        at = self.seconds[rows] - theta[2]
+        way, after = (
+            np.interp(at, self.track_s, self.way),
+            np.searchsorted(self.track_s, at, 'right'),
+        )
         windows = _Windows.of(np.column_stack([way // self.window_m, self.track.part[after - 1]]))
-        used, inverse = self.used[rows], np.zeros((5, 5))
-        weight, std, each = used + 1e-6, NOISE_M, len(rows) / len(windows.first)
+        used, each = self.used[rows], len(rows) / len(windows.first)
+        weight, std = used + 1e-6, NOISE_M
         for _ in range(_ROUNDS):
-            known = each * (std / WHEELS_STD) ** 2
-            residual, slopes, turn, drove = self._linear(
-                mirrored, theta, rows, windows, weight, known
-            )
-            size = np.abs(residual)
+            linear = self._linear(mirrored, theta, rows, windows, weight, each * std**2)
+            size = np.abs(linear.residual)
             std = max(LENGTH_TO_STD * float(np.median(size[used])), NOISE_M)
             weight = (used + 1e-6) / outlier_factor((size / std) ** 2, 2)
-            score = windows.sums(weight[:, None] * (residual[:, None] * slopes.conj()).real)
-            normal = ((weight[:, None] * slopes).conj().T @ slopes).real
-            prior = each * (std / _PRIOR) ** 2  # a window is one observation
-            inverse[np.ix_(free, free)] = np.linalg.inv(
-                (normal + np.diag(prior))[np.ix_(free, free)]
-            )
-            step = inverse @ (score.sum(0) - prior * theta * _PULLED)
-            theta = theta + np.clip(step, -0.5, 0.5)
+            step, covariance = linear.step(theta, free, windows, weight, each * std**2)
+            theta = theta + step
             if np.abs(step).max() < _CLOSE:
                 break
-        if drove.sum() < WINDOWS_MIN:
+        if linear.drove.sum() < WINDOWS_MIN:
             return None
-        covariance = inverse @ (score.T @ score + each * std**2 * normal) @ inverse
         middle = windows.sums(weight * way) / windows.sums(weight)
-        turned = np.interp(way, middle[drove], np.unwrap(np.angle(turn[drove])))
+        turns = linear.turns[linear.drove]
+        turned = np.interp(way, middle[linear.drove], np.unwrap(np.angle(turns)))
         yaw = np.interp(self.seconds[rows] - theta[2], self.track_s, self.track.yaw) + turned
-        return _Fit(mirrored, free, theta, covariance, rows, residual, yaw, turn[drove])
+        return _Fit(mirrored, free, theta, covariance, rows, linear.residual, yaw, turns)
 
     def _linear(
         self,
@@ -218,11 +236,9 @@ class _Comparison:
         rows: Indices,
         windows: _Windows,
         weight: Array,
-        known: float,
-    ) -> tuple[Complex, Complex, Complex, Mask]:
-        """Residuals (M,) m, their derivatives (M, 5) by -theta, and the rotations (W,) of the
-        windows, with a mask of those in which the robot drove.
-        """
+        variance: float,
+    ) -> _Linear:
+        """The model near theta (5,); `variance` (m^2) is that of a window with a weight of 1."""
         at, places = self.seconds[rows] - theta[2], self.places[rows]
         now, later, before = (self._marker(theta, at + by) for by in (0.0, _STEP_S, -_STEP_S))
         velocity = (later[0] - before[0]) / (2 * _STEP_S)
@@ -230,15 +246,15 @@ class _Comparison:
         centered = windows.centered(np.stack(columns, -1), weight).T
         true, velocity, here, facing, driven, lost = centered
         match = windows.sums(weight * here.conj() * true)
-        turn = match / np.maximum(np.abs(match), 1e-12)
-        u = turn[windows.number]
-        slopes = [facing, 1j * facing, -velocity, driven, -lost]
+        turns = match / np.maximum(np.abs(match), 1e-12)
+        u = turns[windows.number]
+        slopes = facing, 1j * facing, -velocity, driven, -lost
         both = np.stack([true - u * here, *(u * slope for slope in slopes)], -1)
         both = windows.without(both, 1j * u * here, weight, 1e-9)
-        both = windows.without(both, u * driven, weight, known)
-        square = windows.sums(weight * np.abs(here) ** 2)
-        drove = square > windows.sums(weight) * (self.window_m / 10) ** 2
-        return both[:, 0], both[:, 1:], turn, drove & (windows.sums(weight) > 1.0)
+        both = windows.without(both, u * driven, weight, variance / WHEELS_STD**2)
+        square, total = windows.sums(weight * np.abs(here) ** 2), windows.sums(weight)
+        drove = (total > 1.0) & (square > total * (self.window_m / 10) ** 2)
+        return _Linear(both[:, 0], both[:, 1:], turns, drove)
 
     def _marker(self, theta: Array, at: Array) -> tuple[Complex, Complex, Complex, Complex]:
         """By the odometry, at times (M,) s: place of the marker, exp(i psi), the place of base_link

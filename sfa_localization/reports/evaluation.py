@@ -84,7 +84,8 @@ def errors_of(truth: Trajectory, estimate: Trajectory) -> Errors:
 
 def tables(scores: Scores) -> str:
     """Position and heading errors as Markdown tables."""
-    return '\n\n'.join(_markdown(*rows(scores)) for rows in (_position_rows, _heading_rows))
+    both = _position_rows(scores), _heading_rows(scores)
+    return '\n\n'.join(_markdown(head, rows) for head, rows in both if rows)
 
 
 def _position_rows(scores: Scores) -> tuple[list[str], list[list[str]]]:
