@@ -34,7 +34,9 @@ def generate_launch_description() -> LaunchDescription:
             'panorama', default_value='', description='topic of panoramas, without an omnicam_node'
         ),
         DeclareLaunchArgument(
-            'image_transport', default_value='raw', description='raw, or compressed images'
+            'image_transport',
+            default_value='raw',
+            description='raw, compressed, ffmpeg or foxglove',
         ),
         DeclareLaunchArgument('odom', default_value='odom', description="odometry's topic"),
         DeclareLaunchArgument(

@@ -21,7 +21,7 @@ from sfa_localization.data.errors import LocalizationError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.rig import Rig
-from sfa_localization.data.run import Image
+from sfa_localization.data.run import Image, Origin
 from sfa_localization.data.threads import one_core
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.light import Conditions
@@ -139,6 +139,12 @@ class PlaceModel:
         """Write to `path` completely or not at all; the same model gives the same bytes."""
         arrays = {**self._arrays(), 'header': np.array(json.dumps(self._header(), sort_keys=True))}
         write_arrays(path, arrays)
+
+    @property
+    def origin(self) -> Origin | None:
+        """Latitude and longitude, degrees, of x = y = 0, if a receiver measured points."""
+        origin = self.quality.get('origin')
+        return (float(origin[0]), float(origin[1])) if origin else None
 
     @classmethod
     def load(cls, path: Path | str) -> PlaceModel:

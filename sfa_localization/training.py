@@ -129,6 +129,7 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     quality: dict[str, Any] = {'features_used': first.map.features, 'turned': turned is not None}
     quality |= {'delta': network.deltas[-1].tolist(), 'rank': [*map(list, network.ranks)]}
     quality |= segments.points.quality(result.points) if segments.points else {}
+    quality |= {'origin': origin} if (origin := given.runs[-1].origin) else {}
     quality |= {'segments': len(segments), **images.quality, **result.quality}
     quality |= keyframe_map.quality
     model = PlaceModel(

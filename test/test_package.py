@@ -38,7 +38,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     '__init__': (set(), set()),
     '__main__': ({'cli'}, set()),
     'data': (set(), {'numpy', 'threadpoolctl', 'tqdm', 'yaml'}),
-    'camera': ({'data'}, NUMERIC | {'cv2', 'yaml'}),
+    'camera': ({'data'}, NUMERIC | {'cv2', 'yaml', 'av'}),
     'sfa': ({'data', 'camera', 'keyframes'}, NUMERIC | {'cv2', 'mdp'}),
     'keyframes': ({'data', 'camera'}, NUMERIC | {'cv2'}),
     'fusion': ({'data'}, NUMERIC | {'filterpy'}),

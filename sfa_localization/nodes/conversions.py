@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages to and from plain values; malformed ones raise MessageError, images CameraError.
+"""ROS messages to and from plain values; malformed ones raise MessageError.
 
 Messages are filled here and nowhere else; `data.messages` reads their fields. Stamps are integer
 nanoseconds, poses are (x m, y m, yaw rad), covariances of poses are (3, 3) in that order.
@@ -23,7 +23,7 @@ from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 
-from sfa_localization.camera.encodings import encode_jpeg, read_compressed, read_raw
+from sfa_localization.camera.encodings import encode_jpeg
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data import messages
 from sfa_localization.data.error_correlation import ErrorCorrelation
@@ -48,12 +48,6 @@ def to_stamp(stamp_ns: int) -> Time:
 def to_quaternion(yaw_rad: float) -> geometry.Quaternion:
     """Rotation about the vertical."""
     return geometry.Quaternion(z=math.sin(yaw_rad / 2), w=math.cos(yaw_rad / 2))
-
-
-def read_image(message: ImageMessage | CompressedImage) -> tuple[int, Image]:
-    """Stamp and image (H, W, 3) uint8 BGR of either image message."""
-    read = read_compressed if isinstance(message, CompressedImage) else read_raw
-    return read_stamp(message.header.stamp), read(message)
 
 
 def to_image(image: Image, stamp_ns: int, frame: str) -> ImageMessage:
