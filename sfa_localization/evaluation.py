@@ -148,7 +148,7 @@ def evaluate(
         recipe = replace(recipe, origin=training_drives[-1].run.origin)
     kind = Smoother if smooth else PoseFilter
     drive = _localized(bag, Localizer(model, config, watch, kind), recipe, progress)
-    aligned_on = 'nothing: the transform was given'
+    aligned_on = 'nothing: coordinates of the map'
     if transform is None:
         aligned_on = ', '.join(map(str, align_bags or [bag]))
         transform = fit_transform(*((d.truth, d.images) for d in training_drives or [drive]))
@@ -175,7 +175,10 @@ def observed(
     """
     run = _read(bag, recipe, progress, want_truth)
     if want_truth:
-        run = replace(run, ground_truth=_true_poses(run, list(headings(run.panoramas))).poses)
+        true = _true_poses(run, list(headings(run.panoramas)))
+        for text in true.sentences:
+            logger.warning('%s: %s', run.name, text)
+        run = replace(run, ground_truth=true.poses)
     return run, list(_observations(run, observer, progress))
 
 
@@ -217,8 +220,6 @@ def _true_poses(run: Run, turns: Sequence[float]) -> TruePoses:
         true = true_poses(run.ground_truth, track, check.confirmed, open_loop)
     except DataError as error:
         raise DataError(f'{run.name}: {error}') from None
-    for text in true.sentences:
-        logger.warning('%s: %s', run.name, text)
     return true
 
 
