@@ -248,7 +248,7 @@ def _other_streams(bag: Bag, recipe: ReadingRecipe, want_truth: bool) -> dict[st
         streams['points'] = bag.stream(name, decoding.place_of)
     if want_truth:
         name = bag.find('ground_truth', topics.ground_truth)
-        streams['ground_truth'] = bag.stream(name, decoding.pose_of)
+        streams['ground_truth'] = bag.stream(name, decoding.true_pose_of)
     return streams
 
 
