@@ -119,14 +119,6 @@ class _Localized:
         axes = [1.0, 1.0, 1.0 if self.true.headings else np.nan]
         return {name: Trajectory(p.stamps_ns, p.poses * axes) for name, p in poses.items()}
 
-    def scores(self, estimates: Mapping[str, Trajectory], turn: Array) -> Scores:
-        """Errors of the `estimates`, and whether the covariances of the tracks are right."""
-        scores = {name: score(self.truth, estimate) for name, estimate in estimates.items()}
-        for name, track in self.tracks.items():
-            scores[name] |= calibration(self.truth, estimates[name], turn, track.covariances)
-            scores[name]['similarity'] = similarity(self.truth, estimates[name])
-        return scores
-
 
 @one_core()
 def evaluate(
@@ -161,12 +153,22 @@ def evaluate(
         aligned_on = ', '.join(map(str, align_bags or [bag]))
         transform = fit_transform(*((d.truth, d.images) for d in training_drives or [drive]))
     estimates = drive.estimates(transform)
-    scores = drive.scores(estimates, rotation(transform.yaw_rad))
+    scores = _scores(drive, estimates, rotation(transform.yaw_rad))
     counts = {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])}
     drives = *training_drives, drive
     corrections = tuple(f'{d.run.name}: {text}' for d in drives for text in d.true.sentences)
-    about = drive.features, aligned_on, transform, corrections
-    return Evaluation(drive.truth, estimates, scores, counts, *about)
+    return Evaluation(
+        drive.truth, estimates, scores, counts, drive.features, aligned_on, transform, corrections
+    )
+
+
+def _scores(drive: _Localized, estimates: Mapping[str, Trajectory], turn: Array) -> Scores:
+    """Errors and calibration of the estimates; `turn` (2, 2) leads from the map to the truth."""
+    scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
+    for name, track in drive.tracks.items():
+        scores[name] |= calibration(drive.truth, estimates[name], turn, track.covariances)
+        scores[name]['similarity'] = similarity(drive.truth, estimates[name])
+    return scores
 
 
 def observed(
