@@ -19,8 +19,9 @@ import numpy as np
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores
 
-from sfa_localization.bags.decoding import FIX, IMAGE, image_of, typestore
+from sfa_localization.bags.decoding import FIX, IMAGE, typestore
 from sfa_localization.bags.writer import blank
+from sfa_localization.camera.encodings import decode_compressed
 from sfa_localization.data.messages import read_yaw
 
 TRAINING, TEST = Path('bags/sample'), Path('bags/sample_test')
@@ -139,7 +140,7 @@ def fixed(m, rng):
 
 def unpacked(m, _):
     """A driver that leaves out the step of raw images."""
-    image = image_of(m)
+    image = decode_compressed(m.data)
     answer = blank(STORE, IMAGE)
     answer.header, answer.encoding, answer.data = m.header, 'bgr8', image.ravel()
     answer.height, answer.width = image.shape[:2]
