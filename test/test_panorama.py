@@ -88,7 +88,7 @@ def test_a_panorama_is_only_resized_turned_and_reversed_to_the_convention():
     big = PanoramaConfig(width=720, height=96)
     other = dataclasses.replace(SMALL, clockwise=False)
     for config, panorama in (
-        (declared, SMALL), (CameraConfig(mount_rpy=turned.mount_rpy), SMALL), (declared, big),
+        (declared, SMALL), (mirror(mount_rpy=turned.mount_rpy), SMALL), (declared, big),
         (declared, other),
     ):  # fmt: skip
         result = Unwrapper(config, panorama)(picture)

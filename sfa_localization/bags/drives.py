@@ -136,7 +136,9 @@ def read_drive(
     with Bag(path, strict=strict, config=recipe.bag) as bag:
         name = bag.find('image', recipe.topics.image)
         try:
-            stored = _PanoramaFile(Path(cache), recipe)
+            # omnicam_node, which publishes it, has mounted and masked the camera.
+            is_made = f'{name.removesuffix("/compressed")}/info' in bag.topics
+            stored = _PanoramaFile(Path(cache), recipe, is_made)
             streams = {'images': bag.stream(name, stored.panorama)}
             streams |= _other_streams(bag, recipe, want_truth)
             values = _read(bag, streams, stored, progress)
@@ -163,10 +165,12 @@ def read_drive(
 class _PanoramaFile:
     """Makes panoramas of one size, and stores them in a temporary file."""
 
-    def __init__(self, folder: Path, recipe: ReadingRecipe) -> None:
+    def __init__(self, folder: Path, recipe: ReadingRecipe, is_made: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as the run
-        self._unwrap = Unwrapper(recipe.camera, recipe.panorama)
+        camera = CameraConfig(blind_sectors=recipe.camera.blind_sectors)
+        self._unwrap = Unwrapper(camera if is_made else recipe.camera, recipe.panorama)
+        self._unwrap.check()
         self._watch = FrozenWatch() if recipe.distinct else None
         self.stamps: list[int] = []
         self._shape: tuple[int, ...] = ()
@@ -174,14 +178,16 @@ class _PanoramaFile:
     def panorama(self, message: Any) -> Image:
         """The panorama of a message. Raises LocalizationError."""
         image = decoding.image_of(message)
-        if not looks_like_panorama(*image.shape[:2]):
-            image = self._unwrap(image)
+        if looks_like_panorama(*image.shape[:2]):
+            if not self._shape:
+                self._unwrap = self._unwrap.keeping_size((image.shape[0], image.shape[1]))
+            elif image.shape != self._shape:
+                height, width = self._shape[:2]
+                raise MessageError(f'size is not {width}x{height} like the first image')
+        image = self._unwrap(image)
         if self._watch is not None and not self._watch.add(image):
             raise MessageError('image repeats the one before')
         self._shape = self._shape or image.shape
-        if image.shape != self._shape:
-            height, width = self._shape[:2]
-            raise MessageError(f'size is not {width}x{height} like the first image')
         return image
 
     def add(self, stamp_ns: int, image: Image) -> None:
