@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from sfa_localization.bags.drives import image_folder, read_drives
+from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
@@ -140,5 +141,6 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         quality,
         keyframe_map.correlation,
         rig_of(given.drives, segments),
+        Unwrapper(given.recipe.camera, given.panorama).repeated,
     )
     return Trained(model, given.runs, images.slow, segments, result)

@@ -21,7 +21,7 @@ from sfa_localization.camera.settings import (
     PanoramaConfig,
 )
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.geometry import Array, Mask
+from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.run import Image
 
 _ASPECT = 3.5  # an image wider than this times its height is a panorama
@@ -117,6 +117,14 @@ class Unwrapper:
         if self.model == 'panorama':
             return True
         return self.model != 'equirectangular' and looks_like_panorama(*size)
+
+    @property
+    def repeated(self) -> Indices | None:
+        """The pixel of a panorama, row by row, that each (H, W) repeats; None: all are visible."""
+        size = self.panorama.height, self.panorama.width
+        visible = build_tables(*self._of_panoramas(), self.panorama, size).visible
+        rows, columns = nearest_visible(visible)
+        return None if visible.all() else rows * size[1] + columns
 
     def keeping_size(self, size: tuple[int, int]) -> Unwrapper:
         """The same for panoramas of `size` (rows, columns), which keep it."""
