@@ -136,9 +136,7 @@ def read_drive(
     with Bag(path, strict=strict, config=recipe.bag) as bag:
         name = bag.find('image', recipe.topics.image)
         try:
-            # omnicam_node, which publishes it, has mounted and masked the camera.
-            is_made = f'{name.removesuffix("/compressed")}/info' in bag.topics
-            stored = _PanoramaFile(Path(cache), recipe, is_made)
+            stored = _PanoramaFile(Path(cache), recipe, _is_ready(bag, name))
             streams = {'images': bag.stream(name, stored.panorama)}
             streams |= _other_streams(bag, recipe, want_truth)
             values = _read(bag, streams, stored, progress)
@@ -162,14 +160,21 @@ def read_drive(
     return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, points, counts, camera)
 
 
+def _is_ready(bag: Bag, topic: str) -> bool:
+    """Whether images are those of omnicam_node, which also publishes their geometry: it has mounted
+    and masked the camera.
+    """
+    return f'{topic.removesuffix("/compressed")}/info' in bag.topics
+
+
 class _PanoramaFile:
     """Makes panoramas of one size, and stores them in a temporary file."""
 
-    def __init__(self, folder: Path, recipe: ReadingRecipe, is_made: bool) -> None:
+    def __init__(self, folder: Path, recipe: ReadingRecipe, is_ready: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as the run
         camera = CameraConfig(blind_sectors=recipe.camera.blind_sectors)
-        self._unwrap = Unwrapper(camera if is_made else recipe.camera, recipe.panorama)
+        self._unwrap = Unwrapper(camera if is_ready else recipe.camera, recipe.panorama)
         self._unwrap.check()
         self._watch = FrozenWatch() if recipe.distinct else None
         self.stamps: list[int] = []
