@@ -120,10 +120,11 @@ def evaluate(
     DataError, also without ground truth.
     """
     recipe = as_live(recipe or Recipe(), model.panorama)
-    training_drives = [
-        _localized(path, Localizer(model, config, watch), _with_topics_of(path, recipe), progress)
-        for path in align_bags
-    ]
+    recipe, training_drives = replace(recipe, origin=model.origin), list[_Localized]()
+    for path in align_bags:
+        here = _with_topics_of(path, recipe)
+        training_drives.append(_localized(path, Localizer(model, config, watch), here, progress))
+        recipe = replace(recipe, origin=training_drives[-1].run.origin)
     kind = Smoother if smooth else PoseFilter
     drive = _localized(bag, Localizer(model, config, watch, kind), recipe, progress)
     aligned_on = 'nothing: the transform was given'
