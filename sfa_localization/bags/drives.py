@@ -204,9 +204,11 @@ class _PanoramaFile:
     def __init__(self, folder: Path, recipe: ReadingRecipe, is_ready: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as the run
-        camera = CameraConfig(blind_sectors=recipe.camera.blind_sectors)
-        self._unwrap = Unwrapper(camera if is_ready else recipe.camera, recipe.panorama)
+        self._unwrap = Unwrapper(recipe.camera, recipe.panorama)
         self._unwrap.check()
+        if is_ready:
+            masked = CameraConfig(blind_sectors=recipe.camera.blind_sectors)
+            self._unwrap = Unwrapper(masked, recipe.panorama)
         self._watch = FrozenWatch() if recipe.distinct else None
         self.stamps: list[int] = []
         self._shape: tuple[int, ...] = ()
