@@ -20,7 +20,7 @@ from sfa_localization.bags.motion_arrays import StampedValues, to_points, to_tra
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.static_transforms import camera_place
-from sfa_localization.bags.topic_stream import Stream
+from sfa_localization.bags.topic_stream import Stream, clock_offset
 from sfa_localization.camera.leveling import LeveledPanoramas, tilts_at
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
@@ -36,6 +36,9 @@ ODOMETRY_TOLERANCE_S = 0.5
 """An image is used when odometry before and after it is this near (s); poses are not interpolated
 over a longer pause."""
 _SAME_IMAGE_NS = 1_000_000  # stamps of one image differ by less
+# Uses of topics whose messages are sent when measured, in words.
+_STAMPED_AT_ONCE = {'images': 'images', 'imu': 'gyroscope', 'orientation': 'orientation',
+                    'ground_truth': 'ground truth'}  # fmt: skip
 logger = logging.getLogger(__name__)
 R = TypeVar('R', bound='ReadingRecipe')
 
@@ -141,7 +144,9 @@ def read_drive(
             streams |= _other_streams(bag, recipe, want_truth)
             values = _read(bag, streams, stored, progress)
             odometry = bag.to_odometry(streams['odometry'], values['odometry'])
-            stamps_ns, near_s = np.array(stored.stamps, np.int64), recipe.odometry_tolerance_s
+            offset_ns = _by_one_clock(bag, streams, values)
+            stamps_ns = np.array(stored.stamps, np.int64) - offset_ns
+            near_s = recipe.odometry_tolerance_s
             covered = odometry.trajectory.covers(stamps_ns, int(near_s * 1e9))
             _require_covered(streams['images'], covered, near_s)
             panoramas: Panoramas = stored.finish(stamps_ns, covered)
@@ -237,6 +242,21 @@ def _read(
             else:
                 values[uses[id(stream)]].append((stamp_ns, value))
     return values
+
+
+def _by_one_clock(bag: Bag, streams: dict[str, Stream], values: dict[str, StampedValues]) -> int:
+    """Stamp the values by the clock of the odometry, where their reception shows another one; return
+    by how much, ns, the stamps of the images are ahead of it. What differs is logged.
+    """
+    images_ns = 0
+    for use, stream in streams.items():
+        if use in _STAMPED_AT_ONCE:
+            ahead_ns, text = clock_offset(_STAMPED_AT_ONCE[use], stream, streams['odometry'])
+            values[use] = [(stamp_ns - ahead_ns, value) for stamp_ns, value in values[use]]
+            images_ns = ahead_ns if use == 'images' else images_ns
+            if text:
+                logger.warning('%s: %s', bag.path, text)
+    return images_ns
 
 
 def _leveled(panoramas: Panoramas, imu: Stream, tilts: StampedValues, sphere: Sphere) -> Panoramas:
