@@ -8,6 +8,7 @@ the training drives and applied unchanged to the test drive; the error is the Eu
 
 from __future__ import annotations
 
+import logging
 import math
 import tempfile
 from collections import Counter
@@ -46,9 +47,13 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
 from sfa_localization.localizer import Localizer
+from sfa_localization.metric.motion_clocks import Drift, drift_sentences, drifts
+from sfa_localization.metric.motion_sources import IMAGES, sources_of
 from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
+
+logger = logging.getLogger(__name__)
 
 Scores = dict[str, dict[str, Any]]
 _TRUTH_TOLERANCE_NS = 500_000_000
@@ -195,11 +200,16 @@ def _localized(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) 
     usable = [observation for observation in observations if not observation.problem]
     if not usable:
         raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
-    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
+    images = run.panoramas.stamps_ns, np.array([*headings(run.panoramas)])
+    clock = camera_clock(run.odometry, *images)
     counts = _counts(run, observations, levels, fused, clock)
+    drifting = drifts(sources_of(run.odometry, images, run.yaw_rate))
+    for text in drift_sentences(drifting):
+        logger.warning('%s: %s', run.name, text)
+    late = drifting.get(IMAGES, Drift(0, clock.delay_ns * 1e-9, 0.0))
     if OpenLoop.of(run.odometry.twists).repeats:  # the robot is late, not the images
-        clock = CameraClock()
-    tracks = {'sfa': _track(usable, clock), 'ekf': FilterTrack.of(states)}
+        late = Drift(0, 0.0, 0.0)
+    tracks = {'sfa': _track(usable, late), 'ekf': FilterTrack.of(states)}
     if isinstance(fused, Smoother):
         tracks['smoothed'] = FilterTrack.of(fused.smoothed())
     features = np.array([observation.slow_features for observation in usable])
@@ -237,9 +247,10 @@ def _seconds_since_last(stamps_ns: Stamps) -> Array:
     return np.minimum(np.diff(stamps_ns, prepend=stamps_ns[:1]) * 1e-9, COAST_S)
 
 
-def _track(usable: Sequence[Observation], clock: CameraClock) -> FilterTrack:
+def _track(usable: Sequence[Observation], clock: Drift) -> FilterTrack:
     """The poses of single images, at the times when they were taken by `clock`."""
-    stamps = np.array([image.stamp_ns for image in usable], np.int64) - clock.delay_ns
+    stamps = np.array([image.stamp_ns for image in usable], np.int64)
+    stamps -= clock.late_ns(stamps)
     poses = np.array([[*image.position, image.yaw] for image in usable])
     return FilterTrack(Trajectory(stamps, poses), np.array([image.covariance for image in usable]))
 

@@ -36,6 +36,7 @@ from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
 from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
+from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.keyframes.closures import STRETCH_M, Textures, driven
 from sfa_localization.keyframes.leveling import tilt_pairs
 from sfa_localization.keyframes.texture import quantized, texture
@@ -382,7 +383,8 @@ class _Survey:
         rates = self._values.get(self._imu, [])
         gyro = to_yaw_rate(sorted(rates)) if rates else None
         is_panorama = camera is not None and camera.is_panorama
-        report.motion = check_motion(odometry, turns, gyro, is_panorama, views)
+        commands = OpenLoop.of(odometry.twists).repeats
+        report.motion = check_motion(odometry, turns, gyro, is_panorama, views, commands)
 
     def _camera_tilt(self, path_m: Array) -> str:
         """How the ground tilts the camera, by pairs of images after `path_m` (N,) of driving."""

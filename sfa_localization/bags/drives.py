@@ -245,8 +245,8 @@ def _read(
 
 
 def _by_one_clock(bag: Bag, streams: dict[str, Stream], values: dict[str, StampedValues]) -> int:
-    """Stamp the values by the clock of the odometry, where their reception shows another one; return
-    by how much, ns, the stamps of the images are ahead of it. What differs is logged.
+    """Stamp the values by the clock of the odometry, where their reception shows another one; log
+    it, and return by how much, ns, the stamps of the images are ahead of it.
     """
     images_ns = 0
     for use, stream in streams.items():

@@ -21,7 +21,7 @@ CLOCK_JUMP_NS = 10_000_000_000
 """A difference this large (10 s) between the steps of stamp and reception is a jump of the sender's
 clock: queues and networks delay a message by less."""
 LEAP_SECONDS = {18: 'GPS time', 19: 'TAI', 37: 'TAI'}
-"""What differs by so many seconds: GPS time from UTC, TAI from GPS time and from UTC, since 2017."""
+"""Seconds, since 2017, by which GPS time is ahead of UTC, TAI of GPS time, and TAI of UTC."""
 
 
 class Item(NamedTuple):
@@ -132,7 +132,7 @@ class Stream:
 
 
 def clock_offset(name: str, stream: Stream, odometry: Stream) -> tuple[int, str]:
-    """By how much, ns, the stamps of a stream are ahead of those of the odometry by the reception of
+    """By how much, ns, a stream's stamps are ahead of those of the odometry by the reception of
     both, and a sentence; 0 and '' for less than turns show, for what queues may have delayed, and
     for bags that do not hold the times of reception.
     """
