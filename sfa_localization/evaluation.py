@@ -200,10 +200,10 @@ def _localized(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) 
     usable = [observation for observation in observations if not observation.problem]
     if not usable:
         raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
-    images = run.panoramas.stamps_ns, np.array([*headings(run.panoramas)])
-    clock = camera_clock(run.odometry, *images)
+    turns = run.panoramas.stamps_ns, np.array([*headings(run.panoramas)])
+    clock = camera_clock(run.odometry, *turns)
     counts = _counts(run, observations, levels, fused, clock)
-    drifting = drifts(sources_of(run.odometry, images, run.yaw_rate))
+    drifting = drifts(sources_of(run.odometry, turns, run.yaw_rate))
     for text in drift_sentences(drifting):
         logger.warning('%s: %s', run.name, text)
     late = drifting.get(IMAGES, Drift(0, clock.delay_ns * 1e-9, 0.0))
