@@ -12,7 +12,8 @@ import numpy as np
 
 from sfa_localization.data.geometry import Array, Mask
 from sfa_localization.data.run import Stamps
-from sfa_localization.metric.motion_samples import OUTLIER, faulty
+from sfa_localization.data.statistics import MEDIAN_TO_STD, outlier_factor, surprise
+from sfa_localization.metric.motion_samples import OUTLIER
 from sfa_localization.metric.motion_sources import (
     EQUAL,
     GRID,
@@ -34,8 +35,9 @@ _RATE_STD = 0.005
 _BEGIN_S = 50.0
 """Time before and after the middle of the turns in which a drift is fitted first: a clock that is
 1 % fast gains less than a turn lasts."""
-_PARTS, _ROUNDS, _SETTLED = 12, 40, 1e-6
-_STEP_S, _SLIGHT_RAD = 0.05, 0.05
+_STEADY = 1e-9  # of the rate of a clock that does not drift
+_PARTS, _ROUNDS, _SETTLED = 12, 20, 1e-5
+_STEP_S, _SLIGHT_RAD = 0.05, 1e-3
 _REACH = 0.3, _RATE_STD  # of one step: the largest change of the delay, s, and of its rate
 # Models of a camera that follows: lag, s, largest rate, rad/s, and turn that it ignores, rad.
 _FOLLOWERS = np.array(
@@ -87,9 +89,10 @@ def drift(a: Source, b: Source) -> Drift | None:
         fit = every.within(radius_s).fitted(fit)
         radius_s *= 2
     rates = [every.where(part != k).fitted(fit)[2] for k in range(_PARTS)]
-    std = float(np.std(rates)) * np.sqrt(_PARTS - 1)
+    std = float(np.sqrt(np.mean((np.array(rates) - fit[2]) ** 2) * (_PARTS - 1)))
     delay_s, rate = sign * fit[1], sign * fit[2]
-    if abs(rate) < OUTLIER * std or abs(rate) * np.ptp(every.seconds) < LATE_S:
+    certain = abs(rate) > OUTLIER * std and every.better(fit) > OUTLIER**2 / 2
+    if not certain or abs(rate) * np.ptp(every.seconds) < LATE_S:
         return None
     at_ns = int(every.at_ns)
     if slow is a:  # fitted over the time of `a`
@@ -107,6 +110,7 @@ class _Turns:
     windows_ns: Stamps
     turns: Array
     at_ns: int
+    rate_std: float = _RATE_STD
 
     @property
     def seconds(self) -> Array:
@@ -151,15 +155,29 @@ class _Turns:
         turned = self._shifted(delay_s, rate)
         later, sooner = (self._shifted(delay_s + by, rate) for by in (_STEP_S, -_STEP_S))
         slope = (later - sooner) / (2 * _STEP_S)
-        right = ~faulty(self.turns - scale * turned, _SLIGHT_RAD)
-        design = np.column_stack([turned, slope, slope * self.seconds])[right]
-        variance = float(np.mean((self.turns - scale * turned)[right] ** 2)) + 1e-12
-        prior = np.diag([0.0, 0.0, variance / (_RATE_STD * max(abs(scale), 0.1)) ** 2])
-        normal = design.T @ design + prior + 1e-9 * np.eye(3)
-        scale, *change = np.linalg.solve(normal, design.T @ self.turns[right]).tolist()
+        error = self.turns - scale * turned
+        std = self._std(error)
+        weight = 1 / (outlier_factor((error / std) ** 2) * std**2)
+        design = np.column_stack([turned, slope, slope * self.seconds])
+        prior = np.diag([0.0, 0.0, 1 / (self.rate_std * max(abs(scale), 0.1)) ** 2])
+        normal = (design.T * weight) @ design + prior + 1e-9 * np.eye(3)
+        scale, *change = np.linalg.solve(normal, design.T @ (weight * self.turns)).tolist()
         size = np.copysign(max(abs(scale), 0.1), scale)
         step_s, step = np.clip(np.divide(change, size), *np.outer((-1, 1), _REACH)).tolist()
         return scale, delay_s + step_s, rate + step
+
+    def _std(self, error: Array) -> float:
+        """Standard deviation, rad, of the errors (M,) of turns that stand out."""
+        moving = np.abs(self.turns) >= typical(self.turns) / 4
+        return MEDIAN_TO_STD * float(np.median(np.abs(error[moving]))) + _SLIGHT_RAD
+
+    def better(self, fit: Fit) -> float:
+        """Logarithm of the ratio of likelihoods of a fit and of the best constant delay."""
+        scale, *steady = replace(self, rate_std=_STEADY).fitted((fit[0], fit[1], 0.0))
+        errors = [self.turns - k * self._shifted(*line) for k, *line in ((scale, *steady), fit)]
+        std = self._std(errors[1])
+        constant, drifting = (surprise((error / std) ** 2, 1).sum() for error in errors)
+        return float(constant - drifting)
 
     def _shifted(self, delay_s: float, rate: float) -> Array:
         """Turns (M,) of the other source in the windows, later by the line."""
