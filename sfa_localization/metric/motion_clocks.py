@@ -15,6 +15,7 @@ from sfa_localization.data.run import Stamps
 from sfa_localization.data.statistics import MEDIAN_TO_STD, outlier_factor, surprise
 from sfa_localization.metric.motion_samples import OUTLIER
 from sfa_localization.metric.motion_sources import (
+    ENOUGH,
     EQUAL,
     GRID,
     IMAGES,
@@ -80,6 +81,8 @@ def drift(a: Source, b: Source) -> Drift | None:
     slow, fast, windows_ns = chosen
     sign = 1 if slow is a else -1
     every = _Turns(fast, windows_ns, slow.moved(windows_ns, 'turns'), windows_ns[0, 0])
+    if every.turned[-1] < ENOUGH['turns']:
+        return None
     part = (_PARTS * every.turned / every.turned[-1]).astype(int).clip(0, _PARTS - 1)
     centers_ns = [every.windows_ns[part >= k][0, 0] for k in range(_PARTS)]
     begins = [replace(every, at_ns=at_ns).within(_BEGIN_S).begin() for at_ns in centers_ns]
