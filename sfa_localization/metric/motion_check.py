@@ -63,7 +63,6 @@ _IMAGES_REMEDIES = {
     'the track of the wheels too wide?',
 }
 _STABILIZED = 'switch stabilization off (direction lock, FlowState, horizon lock)'
-_FREE = IMAGES, GYRO  # sources that measure the robot, not its commands
 _WAY_REMEDIES = {
     'alike': 'is the heading of the pose right?',
     'sign': 'correct the sign of twist.linear.x, or the heading of the pose',
@@ -88,6 +87,17 @@ class MotionCheck:
     def pair(self, a: str, b: str, what: str = 'turns') -> Pair | None:
         """The comparison of b with a."""
         return next((p for p in self.pairs if (p.a, p.b, p.what) == (a, b, what)), None)
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether another device turns like the wheels, or the images turn like the gyroscope."""
+        alike = [
+            pair
+            for pair in self.pairs
+            if pair.what == 'turns' and not any(map(pair.differs, ('alike', 'sign', 'scale')))
+        ]
+        devices = [{pair.a, pair.b} - {TWIST} for pair in alike]
+        return {POSE, IMAGES} in devices or any(GYRO in each and len(each) > 1 for each in devices)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -148,16 +158,13 @@ def check_motion(
 ) -> MotionCheck:
     """Compare all sources of a drive: see `sources_of`, and `contradicted` for the `views`.
 
-    The direction and scale of turns in images that are no `panoramas` yet are unknown. A robot
-    follows odometry that repeats `commands`, and so do its images.
+    Turns of images that are no `panoramas` yet have an unknown direction and scale. Odometry that
+    repeats `commands` is followed by the robot.
     """
-    impossible = list(_impossible(sources_of(odometry, images, gyro)))
-    check = MotionCheck([], odometry, gyro, list(impossible))
+    check = MotionCheck([], odometry, gyro, [*_impossible(sources_of(odometry, images, gyro))])
+    impossible = bool(check.wrong)
     if not impossible:
-        for change in parted, _straightened:
-            check.odometry, text = change(check.odometry)
-            check.corrected += [text] if text else []
-        images = _by_one_clock(check, images)
+        images = _repaired(check, images)
     sources = sources_of(check.odometry, images, check.gyro)
     pairs = [compare(a, b, what) for what in ('turns', 'way') for a, b in combinations(sources, 2)]
     check.pairs = [pair for pair in pairs if pair]
@@ -167,21 +174,20 @@ def check_motion(
     _judge(check, 'way')
     if not impossible:
         _judge_axes(check)
-        _judge_following(check, [one for one in sources if not commands or one.name in _FREE])
+        _judge_following(check, sources, commands)
         _judge(check, 'turns')
         _judge_clocks(check)
         if views is not None:
-            stamps_ns = views[0] - round(turns.late_s * 1e9 if turns else 0)
-            if check.image_drift:
-                stamps_ns = views[0] - check.image_drift.late_ns(views[0])
-            check.odometry, texts = contradicted(check.odometry, stamps_ns, views[1])
+            clock = check.image_drift or Drift(0, turns.late_s if turns else 0.0, 0.0)
+            taken_ns = views[0] - clock.late_ns(views[0])
+            check.odometry, texts = contradicted(check.odometry, taken_ns, views[1])
             check.corrected += texts
-    compared = [pair for pair in check.pairs if IMAGES in (pair.a, pair.b)]
-    if images is not None and not compared and f'{IMAGES} follow' not in ''.join(check.wrong):
+    of_images = [text for text in check.wrong if text.startswith(IMAGES)]
+    if images is not None and not (of_images or any(IMAGES in (p.a, p.b) for p in check.pairs)):
         check.notes.append('images: too few of them, or turns, to tell whether they are mirrored')
     if not panoramas:
-        check.notes += [text for text in check.wrong if text.startswith('images')]
-        check.wrong = [text for text in check.wrong if not text.startswith('images')]
+        check.notes += of_images
+        check.wrong = [text for text in check.wrong if text not in of_images]
     return check
 
 
@@ -252,10 +258,15 @@ def _judge_axes(check: MotionCheck) -> None:
         (check.wrong if sideways > 2 * SIDEWAYS * ahead else check.notes).append(text)
 
 
-def _by_one_clock(
+def _repaired(
     check: MotionCheck, images: tuple[Stamps, Array] | None
 ) -> tuple[Stamps, Array] | None:
-    """The images, and `check.gyro`, stamped by the clock of the odometry where theirs drifts."""
+    """Correct odometry that jumps or heads aside; stamp the images, and `check.gyro`, by its clock
+    where theirs drifts.
+    """
+    for change in parted, _straightened:
+        check.odometry, text = change(check.odometry)
+        check.corrected += [text] if text else []
     drifting = drifts(sources_of(check.odometry, images, check.gyro))
     check.corrected += drift_sentences(drifting)
     if check.gyro is not None and GYRO in drifting:
@@ -268,9 +279,11 @@ def _by_one_clock(
     return images[0] - check.image_drift.late_ns(images[0]), images[1]
 
 
-def _judge_following(check: MotionCheck, sources: Sequence[Source]) -> None:
-    """Report images that follow the robot; their turns then show nothing else."""
-    how = following(sources)
+def _judge_following(check: MotionCheck, sources: Sequence[Source], commands: bool) -> None:
+    """Report images that follow the robot; their turns then show nothing else. The robot itself
+    follows `commands`, which the odometry may repeat.
+    """
+    how = following([one for one in sources if not commands or one.name in (IMAGES, GYRO)])
     if how:
         check.wrong.append(f"{IMAGES} follow the robot's turns {how}: {_STABILIZED}")
         check.pairs = [pair for pair in check.pairs if IMAGES not in (pair.a, pair.b)]
