@@ -58,7 +58,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'reports': ({'data', 'metric', 'training', 'inspection'}, {'numpy', 'matplotlib'}),
     'nodes': (
         {'data', 'camera', 'fusion', 'place_model', 'observer', 'config'},
-        {'numpy', 'yaml'} | ROS,
+        {'numpy', 'yaml', 'nav2_msgs'} | ROS,  # nav2_msgs where it is installed
     ),
     'config': (CORE | {'nodes'}, {'yaml'}),
     'commands': (
