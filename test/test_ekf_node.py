@@ -382,6 +382,10 @@ def test_after_a_restart_it_looks_where_it_was_first(bench, tmp_path):
     play(bench, again, elsewhere)
     assert until(lambda: len(heard) == len(elsewhere.pictures))
     assert np.hypot(*(pose_of(heard[-1]) - elsewhere.poses[elsewhere.pictures[-1]])[:2]) < 0.5
+    (tmp_path / 'file').touch()
+    node = bench.run(EkfNode, pose_file=str(tmp_path / 'file' / 'pose.json'))
+    assert any('cannot be written' in why for why in node.monitors['pose_file'].refused), 'at start'
+    bench.end(node)
     pose_file.write_text('{}')
     for given in ({'initial_pose': AT_ORIGIN}, {}):
         node = bench.run(EkfNode, pose_file=str(pose_file), **given)

@@ -20,6 +20,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Empty, SetBool, Trigger
 
 from sfa_localization.data.errors import MessageError
+from sfa_localization.data.files import require_outputs
 from sfa_localization.data.geometry import Array, compose, invert
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.belief import Pose
@@ -80,6 +81,8 @@ class EkfNode(LocalizationNode):
 
     def setup(self) -> None:
         self._begin()
+        if self._config.pose_file:
+            self.attempt('pose_file', require_outputs, [FilePath(self._config.pose_file)], [])
         self.attempt('pose_file', self._restore_pose)
         self._make_publishers()
         self._subscribe_odometry()
