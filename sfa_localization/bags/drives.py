@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from sfa_localization.bags import decoding
 from sfa_localization.bags.motion_arrays import StampedValues, to_points, to_trajectory, to_yaw_rate
 from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.satellite_fixes import in_plane
 from sfa_localization.bags.settings import BagConfig, TopicNames
-from sfa_localization.bags.static_transforms import camera_place
+from sfa_localization.bags.static_transforms import lever_arm
 from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera.leveling import LeveledPanoramas, tilts_at
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama
@@ -29,7 +30,15 @@ from sfa_localization.data.errors import BagError, DataError, MessageError, Mode
 from sfa_localization.data.files import replaced_mode
 from sfa_localization.data.messages import read_tilt, read_yaw_rate
 from sfa_localization.data.progress import progress_bar
-from sfa_localization.data.run import Image, PanoramaArray, Panoramas, Run, Stamps
+from sfa_localization.data.run import (
+    Image,
+    Origin,
+    PanoramaArray,
+    Panoramas,
+    Points,
+    Run,
+    Stamps,
+)
 from sfa_localization.data.sphere import Sphere
 
 ODOMETRY_TOLERANCE_S = 0.5
@@ -45,7 +54,8 @@ class ReadingRecipe:
     """How a bag becomes a run of panoramas.
 
     Images farther than `odometry_tolerance_s` from odometry are left out (0: images before or after
-    all of it), and with `distinct` also repetitions of the previous image.
+    all of it), and with `distinct` also repetitions of the previous image. Fixes of a satellite
+    receiver count from the `origin`, or the first fix without one.
     """
 
     topics: TopicNames = field(default_factory=TopicNames)
@@ -54,6 +64,7 @@ class ReadingRecipe:
     panorama: PanoramaConfig = field(default_factory=PanoramaConfig)
     odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S
     distinct: bool = False
+    origin: Origin | None = None
 
 
 def as_live(recipe: R, panorama: PanoramaConfig) -> R:
@@ -88,8 +99,11 @@ def read_drives(
 
     Raises BagError or DataError.
     """
-    distinct = replace(recipe, distinct=True)
-    runs = tuple(read_drive(bag, cache, distinct, progress, strict=strict) for bag in bags)
+    given, drives = replace(recipe, distinct=True), list[Run]()
+    for bag in bags:
+        drives.append(read_drive(bag, cache, given, progress, strict=strict))
+        given = replace(given, origin=drives[-1].origin)
+    runs = tuple(drives)
     for (_, other), (bag, run) in itertools.combinations(zip(bags, runs, strict=True), 2):
         if _same_recording(run, other):
             raise DataError(
@@ -150,14 +164,31 @@ def read_drive(
                 panoramas = _leveled(panoramas, imu, tilts, recipe.panorama.sphere)
         except OSError as error:
             raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
-        camera = camera_place(bag, name, streams['odometry'].topic)
+        origin, points = _measured(bag, streams, values, recipe.origin)
+        camera = lever_arm(bag, name, streams['odometry'].topic)
     for problem in bag.problems:
         logger.warning('%s: %s', path, problem)
     counts = {use: stream.count for use, stream in streams.items()}
     yaw_rate = to_yaw_rate(values['imu']) if values.get('imu') else None
     truth = to_trajectory(values['ground_truth']) if values.get('ground_truth') else None
-    points = to_points(values['points']) if values.get('points') else None
-    return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, points, counts, camera)
+    return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, points, counts, camera, origin)
+
+
+def _measured(
+    bag: Bag, streams: dict[str, Stream], values: dict[str, StampedValues], origin: Origin | None
+) -> tuple[Origin | None, Points | None]:
+    """The origin of fixes, and measured points; fixes in `values` become places in its plane."""
+    kinds = {use: bag.topics[stream.topic].kind for use, stream in streams.items()}
+    for use in ('points', 'ground_truth'):
+        if kinds.get(use) == decoding.FIX:
+            origin = origin or values[use][0][1][:2]
+            values[use] = in_plane(values[use], origin)
+    if not values.get('points'):
+        return origin, None
+    lever = None
+    if kinds['points'] == decoding.FIX:
+        lever = lever_arm(bag, streams['points'].topic, streams['odometry'].topic)
+    return origin, to_points(values['points'], lever or 0j)
 
 
 class _PanoramaFile:
@@ -171,9 +202,8 @@ class _PanoramaFile:
         self.stamps: list[int] = []
         self._shape: tuple[int, ...] = ()
 
-    def panorama(self, message: Any) -> Image:
-        """The panorama of a message. Raises LocalizationError."""
-        image = decoding.image_of(message)
+    def panorama(self, image: Image) -> Image:
+        """The panorama of a camera's image. Raises LocalizationError."""
         if not looks_like_panorama(*image.shape[:2]):
             image = self._unwrap(image)
         if self._watch is not None and not self._watch.add(image):
@@ -218,7 +248,7 @@ def _other_streams(bag: Bag, recipe: ReadingRecipe, want_truth: bool) -> dict[st
         streams['points'] = bag.stream(name, decoding.place_of)
     if want_truth:
         name = bag.find('ground_truth', topics.ground_truth)
-        streams['ground_truth'] = bag.stream(name, decoding.pose_of)
+        streams['ground_truth'] = bag.stream(name, decoding.true_pose_of)
     return streams
 
 

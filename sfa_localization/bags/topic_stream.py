@@ -4,12 +4,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sfa_localization.data.errors import BagError
+from sfa_localization.camera.video import ImageReader
+from sfa_localization.data.errors import BagError, LocalizationError
 from sfa_localization.data.messages import NO_STAMP
 from sfa_localization.data.rejections import RejectionCounter
 from sfa_localization.data.run import Count
@@ -48,9 +49,9 @@ class Item(NamedTuple):
 class Stream:
     """One topic being read, with the number of used messages, and of skipped ones by reason.
 
-    `convert` makes a value of a message, or of its transform to `frame`. Messages of an opaque
-    stream are not decoded: their value is None. `strict` raises for a faulty message; a `required`
-    stream must have a usable message.
+    `convert` makes a value of a message, of its transform to `frame`, or of an image that
+    `images` reads. Messages of an opaque stream are not decoded: their value is None. `strict`
+    raises for a faulty message; a `required` stream must have a usable message.
 
     Messages pass in increasing order of stamp, each when the next one has come. A single stamp that
     is ahead of the next is skipped, as is a jump that the next does not continue; a lasting jump is
@@ -62,6 +63,7 @@ class Stream:
     convert: Callable[[Any], Any]
     strict: bool
     frame: str | None = None
+    images: ImageReader | None = None
     required: bool = True
     opaque: bool = False
     received: int = 0
@@ -80,6 +82,18 @@ class Stream:
             raise BagError(f'{self.bag}: {self.topic}: {reason}; '
                            'read without --strict to skip such messages')  # fmt: skip
         self.skipped.add(reason)
+
+    def values(self, parts: Iterable[tuple[int, Any]], receive_ns: int) -> Iterator[Item]:
+        """The values of messages or images; faulty ones are counted."""
+        for stamp_ns, part in parts:
+            try:
+                if isinstance(part, LocalizationError):
+                    raise part
+                yield Item(stamp_ns, receive_ns, part if self.opaque else self.convert(part))
+            except BagError:
+                raise
+            except LocalizationError as error:
+                self.skip(str(error))
 
     def push(self, item: Item) -> list[Item]:
         """The message to be used now, if any; the latest is held back until `flush`."""

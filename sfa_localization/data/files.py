@@ -33,12 +33,22 @@ def read_regular(path: Path | str, largest: int) -> bytes:
     if '\0' in str(path):
         raise OSError('a path with a zero byte')
     if os.path.exists(path) and not os.path.isfile(path):
-        raise OSError('it is no regular file')
+        raise OSError(f'it {absence(path)}')
     with open(path, 'rb') as file:
         data = file.read(largest + 1)
     if len(data) > largest:
         raise OSError(f'larger than {largest} bytes')
     return data
+
+
+def read_text(path: Path | str, largest: int, error: type[LocalizationError]) -> str:
+    """The text of a regular file of at most `largest` bytes. Raises `error` naming the path."""
+    try:
+        return read_regular(path, largest).decode('utf-8-sig')
+    except OSError as reason:
+        raise error(f'{path}: cannot be read: {reason.strerror or reason}') from None
+    except UnicodeDecodeError as reason:
+        raise error(f'{path}: cannot be read: {reason.reason}') from None
 
 
 def first_bytes(path: Path, most: int = 1000) -> bytes:

@@ -20,6 +20,13 @@ from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.rejections import quoted
 
 S = TypeVar('S', bound='Settings')
+_FORMS = {
+    bool: 'true or false',
+    float: 'a number',
+    int: 'a whole number',
+    str: 'a text; put it in quotes',
+    tuple: 'a list of numbers, such as [1.0, 2.5]',
+}
 
 
 def setting(
@@ -93,7 +100,7 @@ def _converted(where: str, default: Any, value: Any) -> Any:
         with suppress(OverflowError):  # of an integer beyond all floats
             return float(value)
     if isinstance(value, bool) != isinstance(default, bool) or not isinstance(value, type(default)):
-        raise ConfigError(f'{where}: {quoted(value)} is not of type {type(default).__name__}')
+        raise ConfigError(f'{where}: {quoted(value)} is not {_FORMS[type(default)]}')
     return value
 
 

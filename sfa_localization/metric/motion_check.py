@@ -85,6 +85,17 @@ class MotionCheck:
         """The comparison of b with a."""
         return next((p for p in self.pairs if (p.a, p.b, p.what) == (a, b, what)), None)
 
+    @property
+    def confirmed(self) -> bool:
+        """Whether another device turns like the wheels, or the images turn like the gyroscope."""
+        alike = [
+            pair
+            for pair in self.pairs
+            if pair.what == 'turns' and not any(map(pair.differs, ('alike', 'sign', 'scale')))
+        ]
+        devices = [{pair.a, pair.b} - {TWIST} for pair in alike]
+        return {POSE, IMAGES} in devices or any(GYRO in each and len(each) > 1 for each in devices)
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         rows = [dict(zip(HEAD, pair.row(), strict=True)) for pair in self.pairs]

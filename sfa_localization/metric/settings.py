@@ -67,3 +67,13 @@ class MetricConfig(Settings):
         require_pose('start_pose', self.start_pose)
         if len(self.camera_xy) not in (0, 2):
             raise ConfigError(f'camera_xy: {self.camera_xy} is not empty, and not ahead, left')
+
+
+@dataclass(frozen=True, slots=True)
+class GroundConfig(Settings):
+    """The driven ground as a map of cells; by default lanes that are 1 m apart join."""
+
+    width: float = setting(
+        1.0, 'width of the robot with its margin', unit='m', low=0.05, high=100.0
+    )
+    cell: float = setting(0.05, 'size of a cell', unit='m', low=0.01, high=10.0)

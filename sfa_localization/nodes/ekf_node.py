@@ -86,7 +86,9 @@ class EkfNode(LocalizationNode):
         self.attempt('pose_file', self._restore_pose)
         self._make_publishers()
         self._subscribe_odometry()
-        self.discovery = Discovery(self, _ODOM, [Odometry], ['odom'], self._subscribe_odometry)
+        self.discovery = Discovery(
+            self, _ODOM, ['nav_msgs/msg/Odometry'], ['odom'], self._subscribe_odometry
+        )
         pose = geometry.PoseWithCovarianceStamped
         self.subscribe(pose, _IMAGE_POSE, self._receive_pose, sensor_qos(20))
         self.subscribe(

@@ -122,11 +122,13 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         callback: Callable[[Any], None],
         qos: QoSProfile,
         substitute: str = '',
+        entity: str | None = None,
     ) -> Any:
         """A subscription that counts messages, and those which `callback` rejects, under `topic`.
 
         An inactive node drops messages, except latched ones, which come only once. The topic
-        `substitute`, if given, is subscribed to in place of `topic`.
+        `substitute`, if given, is subscribed to in place of `topic`. Subscriptions of another
+        `entity` have their own qos_overrides.
         """
         latched = qos.durability is DurabilityPolicy.TRANSIENT_LOCAL
         self.require_input(topic, substitute)
@@ -140,7 +142,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             substitute or topic,
             cast(Any, receive),
             qos,
-            qos_overriding_options=_QOS_PARAMETERS,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(entity_id=entity),
         )
         self._entities[subscription] = self.destroy_subscription
         return subscription

@@ -29,6 +29,7 @@ from sfa_localization.data.settings import Settings
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes import lifecycle
 from sfa_localization.nodes.discovery import Discovery
+from sfa_localization.nodes.image_input import ImageInput
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import OmnicamNodeConfig
@@ -57,8 +58,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def _begin(self) -> None:
         self._feed: Feed | None = None
         self._losses = 0
-        self._subscription: Any = None
         self._listening_since_s: float | None = None
+        self._images: ImageInput | None = None
         self._newest: deque[tuple[int, Image]] = deque(maxlen=1)
         self._tilts: deque[tuple[int, float, float]] = deque(maxlen=_ORIENTATIONS)
         self._is_level = True
@@ -73,16 +74,17 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._compressed = self.publisher(CompressedImage, compressed, 2)
         info = self.following('panorama/info')
         self._info = self.publisher(String, info, lifecycle.latched_qos())
-        raw = self._config.image_transport == 'raw'
-        self._input = 'image_raw' if raw else self.following('image_raw/compressed')
+        transport = self._config.image_transport
+        raw = transport == 'raw'
+        self._input = 'image_raw' if raw else self.following(f'image_raw/{transport}')
         self.discovery: Discovery | None = None
         self._substitute = ''
         capture = self.settings(CaptureConfig)
         if capture.source == 'topic':
             self.require_input(self._input)
-            self._kinds = [ImageMessage, CompressedImage][:: 1 if raw else -1]
-            arguments = 'image', 'panorama'
-            self.discovery = Discovery(self, self._input, self._kinds, arguments, self._take)
+            self._images = ImageInput(self, transport, self._input, self._publish)
+            types, arguments = self._images.types, ('image', 'panorama')
+            self.discovery = Discovery(self, self._input, types, arguments, self._take)
         else:
             self._input = capture.source_path
             self._arrival = self.create_guard_condition(self._arrived)
@@ -114,12 +116,9 @@ class OmnicamNode(lifecycle.LocalizationNode):
             self._report_loss(self._feed.check())
         elif not self._wanted():
             self._stop_listening()
-        elif self._listening_since_s is None:
+        elif self._listening_since_s is None and self._images is not None:
             self._listening_since_s = steady_s()
-            kind, qos = self._kinds[0], lifecycle.sensor_qos(1)
-            self._subscription = self.subscribe(
-                kind, self._input, self._use_message, qos, self._substitute
-            )
+            self._images.start(self._substitute)
 
     def _report_loss(self, status: FeedStatus) -> None:
         """Log and count each time that the source could not be opened, or was lost."""
@@ -134,12 +133,9 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._substitute = topic
 
     def _stop_listening(self) -> None:
-        self.unsubscribe(self._subscription)
-        self._subscription = self._listening_since_s = None
-
-    def _use_message(self, message: ImageMessage | CompressedImage) -> None:
-        stamp_ns, image = convert.read_image(message)
-        self._publish(image, stamp_ns, self._config.frame_id or message.header.frame_id)
+        if self._images is not None:
+            self._images.stop()
+        self._listening_since_s = None
 
     def _deliver(self, image: Image) -> None:
         """Keep the newest image, and wake the executor; called by the feed's thread."""
@@ -157,7 +153,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         stamp_ns, image = delivered
         if stamp_ns <= 0:
             raise MessageError('the clock has not started')
-        self._publish(image, stamp_ns, self._config.frame_id)
+        self._publish(stamp_ns, image, '')
 
     def _take_orientation(self, message: Imu) -> None:
         stamp_ns, tilt = read_stamp(message.header.stamp), read_tilt(message)
@@ -176,8 +172,9 @@ class OmnicamNode(lifecycle.LocalizationNode):
         sphere = self.settings(PanoramaConfig).sphere
         return leveled(panorama, tilt, sphere) if self._is_level else panorama
 
-    def _publish(self, image: Image, stamp_ns: int, frame: str) -> None:
-        panorama, frame = self._leveled(self._unwrapper(image), stamp_ns), frame or 'omnicam'
+    def _publish(self, stamp_ns: int, image: Image, frame: str) -> None:
+        panorama = self._leveled(self._unwrapper(image), stamp_ns)
+        frame = self._config.frame_id or frame or 'omnicam'
         self._size = (image.shape[0], image.shape[1])
         if self._panoramas.get_subscription_count():
             self._panoramas.publish(convert.to_image(panorama, stamp_ns, frame))
