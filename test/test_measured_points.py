@@ -50,7 +50,7 @@ WHEELS = 1.02
 
 def points(places):
     """Points at places (K,), known to STD."""
-    return Points.of([(f'point {k}', k, complex(at), STD) for k, at in enumerate(places)])
+    return Points.of([(f'point {k}', k, complex(at), STD, 0j) for k, at in enumerate(places)])
 
 
 def settled(measured, places, std=0.02):
@@ -129,7 +129,9 @@ def measured_at(rows, wrong=None):
     places = places + STD * (rng.standard_normal(len(rows)) + 1j * rng.standard_normal(len(rows)))
     places[[] if wrong is None else [wrong]] += 2.0
     stamps = run.stamps_ns[rows].tolist()
-    return Points.of([(f'point {k}', stamps[k], at, STD) for k, at in enumerate(places.tolist())])
+    return Points.of(
+        [(f'point {k}', stamps[k], at, STD, 0j) for k, at in enumerate(places.tolist())]
+    )
 
 
 def drive_of(run, odometry):
@@ -218,7 +220,7 @@ def test_points_bend_a_route_straight():
     item = drive_of(run, run.odometry)
     rows, config = np.linspace(5, len(run.poses) - 6, 8).astype(int), SegmentConfig()
     given = Points.of([
-        (str(k), int(run.stamps_ns[row]), complex(*run.poses[row, :2]), STD)
+        (str(k), int(run.stamps_ns[row]), complex(*run.poses[row, :2]), STD, 0j)
         for k, row in enumerate(rows.tolist())
     ])  # fmt: skip
     missed = []
@@ -247,7 +249,7 @@ def test_stops_are_named_by_their_number(tmp_path):
         np.array([[0.0, 3.0], [8.0 + 1 / 0.6, 11.0 + 1 / 0.6]]), abs=0.1
     )
     file.write_text('stamp_s,x_m,y_m,std_m\n# a mark\nstop, 2, 4.0, 1.5\n12.5, 3, -1, 0.05\n')
-    read = read_points(file, odometry)
+    read = read_points(file, [odometry])
     assert read.names == ('stop 2', 'point of 12.5 s')
     assert read.stamps_ns == pytest.approx([stops(odometry)[1].mean(), 12_500_000_000], abs=1)
     assert read.places.tolist() == [4 + 1.5j, 3 - 1j] and read.std.tolist() == [0.02, 0.05]
@@ -257,19 +259,20 @@ def test_stops_are_named_by_their_number(tmp_path):
     ('stop, 3, 1, 1', 'stands 2 times'), ('stop, 0, 1, 1', 'no stop 0'),
     ('12.5, 1', 'is no point'), ('12.5, one, 2', 'is no point'), ('12.5, 1, 2, 0', 'is no point'),
     ('12.5, nan, 2', 'is no point'), ('# nothing', 'holds no points'),
+    ('stop, 3, 1, 1\nstop, 1, O, 1', "line 2: 'stop, 1, O, 1' is no point"),
 ])  # fmt: skip
 def test_a_line_that_is_no_point_is_an_error_that_names_it(tmp_path, line, said):
     file = tmp_path / 'points.csv'
     file.write_text(line)
     with pytest.raises(DataError, match=said):
-        read_points(file, standing())
+        read_points(file, [standing()])
 
 
 def test_a_point_of_no_drive_is_an_error_before_anything_is_learned(tmp_path):
     file = tmp_path / 'points.csv'
     file.write_text('Stop, 2, 4.0, 1.5\n12.5, 3, -1\n')
     run = drive(np.vstack([stand(3), straight(4), stand(3), straight(1)]))
-    with pytest.raises(DataError, match=r'12\.5 s: outside of the drives'):
+    with pytest.raises(DataError, match=r'line 2: point of 12\.5 s: outside of the drives'):
         points_of([run], str(file))
 
 

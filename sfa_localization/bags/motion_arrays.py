@@ -44,10 +44,12 @@ def to_yaw_rate(values: StampedValues) -> YawRate:
     return YawRate(_stamps(values), rates[:, 0], rates[:, 1])
 
 
-def to_points(values: StampedValues) -> Points:
-    """Measured places; the values are x, y and a standard deviation, POINT_STD_M where it is 0."""
+def to_points(values: StampedValues, lever: complex = 0j) -> Points:
+    """Measured places of what is `lever` ahead + i left of base_link, m; the values are x, y and a
+    standard deviation, POINT_STD_M where it is 0.
+    """
     return Points.of([
-        (f'point of {stamp_ns * 1e-9:.1f} s', stamp_ns, complex(x, y), std or POINT_STD_M)
+        (f'point of {stamp_ns * 1e-9:.1f} s', stamp_ns, complex(x, y), std or POINT_STD_M, lever)
         for stamp_ns, (x, y, std) in values
     ])  # fmt: skip
 

@@ -115,11 +115,10 @@ def _beyond(wheels: Source, stamps_ns: Stamps, omega: Array) -> Array:
     """By how much yaw rates (N,) contradict those of the wheels around their stamps, rad/s; 0 where
     they do not.
     """
-    steps = [np.diff(each) * 1e-9 for each in (wheels.stamps_ns, stamps_ns)]
-    period_s = max(float(np.median(step)) for step in steps)
-    reach_s = max(float(np.percentile(step, 99)) for step in steps)  # as they may come in bundles
-    reach_s += period_s
-    around = np.linspace(-reach_s, reach_s, _SHIFTS)[:, None]
+    # Messages may come in bundles.
+    steps = (np.diff(each) * 1e-9 for each in (wheels.stamps_ns, stamps_ns))
+    period_s = max(float(np.percentile(step, 99)) for step in steps)
+    around = np.linspace(-2 * period_s, 2 * period_s, _SHIFTS)[:, None]
     middle = stamps_ns + np.round(around * 1e9).astype(np.int64)
     half_ns = round(period_s * 5e8)
     rates = wheels.moved(np.stack([middle - half_ns, middle + half_ns], -1), 'turns') / period_s
@@ -153,6 +152,7 @@ def is_worse(odometry: Odometry, images: tuple[Stamps, Array] | None, gyro: YawR
     windows = np.column_stack([at[:-1], at[1:]])
     more = wheels.moved(windows, 'turns') - rates.moved(windows + _late_ns(rate), 'turns')
     whole = without_pause(at[:-1], at[1:], gyro.stamps_ns - _late_ns(rate), GAP_MAX_S)
+    whole &= at[1:] > at[:-1]
     if not whole.any():
         return False
     seconds, by_gyro = np.diff(at)[whole] * 1e-9, wrap_angle(by_wheels + more)[whole]

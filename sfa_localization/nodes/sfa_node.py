@@ -11,18 +11,22 @@ from typing import Any, cast
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, QuaternionStamped
-from sensor_msgs.msg import CompressedImage, Image
+from nav_msgs.msg import OccupancyGrid
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
 
 from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
 from sfa_localization.camera.watch import EXPLAINED_WARNING
 from sfa_localization.data.errors import ConfigError, MessageError
+from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.camera_clock import NEAR_NS
+from sfa_localization.metric.settings import GroundConfig
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.discovery import Discovery
-from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, sensor_qos
+from sfa_localization.nodes.image_input import ImageInput
+from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos
 from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import SfaNodeConfig
 from sfa_localization.observer import Observation, Observer
@@ -51,20 +55,21 @@ class SfaNode(LocalizationNode):
         self._uncertain = self.publisher(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
         latched = latched_qos()
         self._rig = self.publisher(String, 'sfa/rig', latched)
+        self._map = self.publisher(OccupancyGrid, 'sfa/map', latched)
+        self._paths = self.publisher(MarkerArray, 'sfa/map_paths', latched)
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
         self._declared: PanoramaConfig | None = None
         self._info = self.following('panorama/info')
         self.subscribe(String, self._info, self._receive_info, latched)
-        compressed = self._config.image_transport == 'compressed'
-        self._topic = self.following('panorama/compressed') if compressed else 'panorama'
-        kinds = [CompressedImage, Image] if compressed else [Image, CompressedImage]
-        # With depth 1 the oldest image is dropped when images come faster than they are located.
-        self.subscribe(kinds[0], self._topic, self._receive, sensor_qos(1))
-        self.discovery = Discovery(self, self._topic, kinds, ['panorama'])
+        transport = self._config.image_transport
+        self._topic = 'panorama' if transport == 'raw' else self.following(f'panorama/{transport}')
+        images = ImageInput(self, transport, self._topic, self._locate)
+        images.start()
+        self.discovery = Discovery(self, self._topic, images.types, ['panorama'])
 
     def started(self) -> None:
-        self._publish_rig()
+        self._publish_map()
 
     def teardown(self) -> None:
         self._observer = None
@@ -97,18 +102,21 @@ class SfaNode(LocalizationNode):
         """Switch to another model; an unconfigured node loads its model when configured."""
         if self._observer is not None:
             self._observer.use(model)
-            self._publish_rig()
+            self._publish_map()
 
     def _reload(self, _: Any, response: Any) -> Any:
         self._use(self._load(self._config.model))
         response.success, response.message = True, f'loaded {self._config.model}'
         return response
 
-    def _publish_rig(self) -> None:
-        """Publish what ekf_node needs to know of the model."""
+    def _publish_map(self) -> None:
+        """Publish where the robot drove in training, and what ekf_node needs to know."""
         assert self._observer is not None
-        model = self._observer.model
+        model, frame = self._observer.model, self._config.map_frame
+        now_ns = self.get_clock().now().nanoseconds
         self._rig.publish(convert.to_rig(model.rig, model.error_correlation))
+        self._map.publish(convert.to_grid(model.ground.cells(GroundConfig()), now_ns, frame))
+        self._paths.publish(convert.to_lines(model.ground, now_ns, frame))
 
     def _receive_info(self, message: String) -> None:
         self._declared = convert.read_info(message)
@@ -123,11 +131,11 @@ class SfaNode(LocalizationNode):
             'set these parameters of omnicam_node'
         )
 
-    def _receive(self, message: Image | CompressedImage) -> None:
+    def _locate(self, stamp_ns: int, image: Image, _: str) -> None:
         assert self._observer is not None
         if problem := self._declared_problem(self._observer.model.panorama):
             raise MessageError(problem)
-        self._last = observation = self._observer.observe(*convert.read_image(message))
+        self._last = observation = self._observer.observe(stamp_ns, image)
         self._publish(observation)
         if observation.problem:
             raise MessageError(observation.problem)
