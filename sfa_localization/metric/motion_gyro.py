@@ -16,7 +16,7 @@ from scipy.special import expit, logit
 
 from sfa_localization.data.geometry import Array, Mask, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
-from sfa_localization.data.statistics import MEDIAN_TO_STD
+from sfa_localization.data.statistics import MEDIAN_TO_STD, surprise
 from sfa_localization.metric.dead_reckoning import GAP_MAX_S, summed, without_pause
 from sfa_localization.metric.motion_samples import OUTLIER, fault_sentence, faulty
 from sfa_localization.metric.motion_sources import (
@@ -77,7 +77,7 @@ def _guilty(stamps_ns: Stamps, beyond: Array, at: Stamps, error: Array) -> Mask:
     wrong = np.bincount(window, beyond * np.gradient(stamps_ns * 1e-9), len(at) + 1)
     error = np.pad(error, 1)
     variance = max((MEDIAN_TO_STD * float(np.median(np.abs(error)))) ** 2, 1e-12)
-    ratio = np.clip(wrong * (wrong - 2 * error) / (2 * variance), -_SURE, _SURE)
+    ratio = surprise((error - wrong) ** 2 / variance, 1) - surprise(error**2 / variance, 1)
     ratio[[0, -1]] = 0.0
     faults = beyond != 0
     run = summed(np.diff(faults) & faults[1:]).astype(np.int64)
