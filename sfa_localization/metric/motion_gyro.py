@@ -16,7 +16,7 @@ from scipy.special import expit, logit
 
 from sfa_localization.data.geometry import Array, Mask, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
-from sfa_localization.data.statistics import MEDIAN_TO_STD, surprise
+from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile, surprise
 from sfa_localization.metric.dead_reckoning import GAP_MAX_S, summed, without_pause
 from sfa_localization.metric.motion_samples import OUTLIER, fault_sentence, faulty
 from sfa_localization.metric.motion_sources import (
@@ -55,8 +55,8 @@ def cleaned(
             return gyro, ''
         wheels, rate, seen = compared
         stamps_ns = gyro.stamps_ns - _late_ns(rate)
-        at, error = _between(wheels, images, seen, seen.scale)
-        mask = _guilty(stamps_ns, _beyond(wheels, stamps_ns, gyro.omega / rate.scale), at, error)
+        beyond = _beyond(wheels, stamps_ns, gyro.omega / rate.scale)
+        mask = _guilty(stamps_ns, beyond, *_between(wheels, images, seen, seen.scale))
         kept = YawRate(gyro.stamps_ns[~mask], gyro.omega[~mask], gyro.variance[~mask])
     return kept, fault_sentence(GYRO, mask, gyro.stamps_ns, 'wheels and images')
 
@@ -66,17 +66,18 @@ def _smooth(omega: Array) -> Array:
     return np.asarray(np.median(sliding_window_view(np.pad(omega, 2, 'edge'), 5), axis=1))
 
 
-def _guilty(stamps_ns: Stamps, beyond: Array, at: Stamps, error: Array) -> Mask:
+def _guilty(stamps_ns: Stamps, beyond: Array, at: Stamps, turned: Array, error: Array) -> Mask:
     """Which samples (N,) of a gyroscope, `beyond` the wheels by rad/s, are faulty: there the turns
-    between images `at` (M,) agree with the wheels but for an `error` (M - 1,), rad.
+    between images `at` (M,) agree with those of the wheels, `turned` (M - 1,) rad, but for an
+    `error` (M - 1,), as usual in turns.
 
     A run of contradictions is one fault, or one slip of the wheels. The share of faults is
     estimated from all runs; it decides where images do not.
     """
     window = np.searchsorted(at, stamps_ns, 'right')  # 0 and M are before and after all images
     wrong = np.bincount(window, beyond * np.gradient(stamps_ns * 1e-9), len(at) + 1)
-    error = np.pad(error, 1)
-    variance = max((MEDIAN_TO_STD * float(np.median(np.abs(error)))) ** 2, 1e-12)
+    usual = quantile(np.abs(error), 0.5, np.maximum(np.abs(turned), 1e-9))
+    variance, error = max((MEDIAN_TO_STD * usual) ** 2, 1e-12), np.pad(error, 1)
     ratio = surprise((error - wrong) ** 2 / variance, 1) - surprise(error**2 / variance, 1)
     ratio[[0, -1]] = 0.0
     faults = beyond != 0
@@ -130,13 +131,13 @@ def _beyond(wheels: Source, stamps_ns: Stamps, omega: Array) -> Array:
 
 def _between(
     wheels: Source, images: tuple[Stamps, Array], seen: Pair, scale: float
-) -> tuple[Stamps, Array]:
-    """Stamps (M,) of images by the clock of the wheels, and by how much their turns (M - 1,), over
-    a scale, exceed those of the wheels, rad.
+) -> tuple[Stamps, Array, Array]:
+    """Stamps (M,) of images by the clock of the wheels, the turns (M - 1,) of the wheels between
+    them, and by how much those of the images, over a scale, exceed these, rad.
     """
     at = images[0] - _late_ns(seen)
     turned = wheels.moved(np.column_stack([at[:-1], at[1:]]), 'turns')
-    return at, wrap_angle(np.diff(images[1]) - scale * turned) / scale
+    return at, turned, wrap_angle(np.diff(images[1]) - scale * turned) / scale
 
 
 def is_worse(odometry: Odometry, images: tuple[Stamps, Array] | None, gyro: YawRate | None) -> bool:
@@ -147,10 +148,10 @@ def is_worse(odometry: Odometry, images: tuple[Stamps, Array] | None, gyro: YawR
     if gyro is None or images is None or compared is None:
         return False
     wheels, rate, seen = compared
-    at, by_wheels = _between(wheels, images, seen, np.sign(seen.scale))
+    at, turned, by_wheels = _between(wheels, images, seen, np.sign(seen.scale))
     (rates,) = (source for source in sources_of(odometry, None, gyro) if source.name == GYRO)
     windows = np.column_stack([at[:-1], at[1:]])
-    more = wheels.moved(windows, 'turns') - rates.moved(windows + _late_ns(rate), 'turns')
+    more = turned - rates.moved(windows + _late_ns(rate), 'turns')
     whole = without_pause(at[:-1], at[1:], gyro.stamps_ns - _late_ns(rate), GAP_MAX_S)
     whole &= at[1:] > at[:-1]
     if not whole.any():
