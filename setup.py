@@ -19,6 +19,7 @@ COMMANDS = (
     'inspect',
     'calibrate',
     'filter',
+    'map',
     'tune',
     'config',
     'demo',
@@ -68,6 +69,8 @@ setup(
     extras_require={
         # Real ROS 2 Jazzy without a ROS installation (Linux x86-64).
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+        # The release after Jazzy, for `make matrix`.
+        'kilted': ['ros-kilted-rclpy[fastrtps]', 'ros-kilted-common-interfaces'],
         # The simulated garden of `simulate` and `demo`.
         'simulation': ['trimesh>=4.4', 'embreex>=2.17.7'],
         # Images that are recorded or published as H.264 or H.265 video.

@@ -29,6 +29,7 @@ from sfa_localization.keyframes.location import Location, hypotheses, located
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE, Observation
 from sfa_localization.keyframes.regression import Fit
 from sfa_localization.keyframes.upright import UprightImage, upright
+from sfa_localization.metric.driven_ground import DrivenGround
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.turned_maps import TurnedMaps
 from sfa_localization.sfa.image_features import (
@@ -47,7 +48,7 @@ from sfa_localization.sfa.network import (
 )
 
 FORMAT = 'sfa_localization place model'
-VERSION = 15
+VERSION = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,15 +67,16 @@ class PlaceModel:
     """Network, metric map and keyframes, learned from one place.
 
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the figures
-    of merit of the training, `error_correlation` that of neighboring images, `rig` the robot. Map
-    and keyframes hold places of the camera. The map reads `turned` maps, or slow features where
-    there are none.
+    of merit of the training, `error_correlation` that of neighboring images, `rig` the robot, and
+    `ground` where it drove. Map and keyframes hold places of the camera. The map reads `turned`
+    maps, or slow features where there are none.
     """
 
     network: Network
     metric: MetricMap
     panorama: PanoramaConfig
     keyframes: Keyframes
+    ground: DrivenGround
     turned: TurnedMaps | None = None
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
@@ -200,6 +202,7 @@ class PlaceModel:
             arrays |= _prefixed(f'network/{depth}/', {**parts, 'delta': self.network.deltas[depth]})
         arrays |= _prefixed('metric/', self.metric.to_arrays())
         arrays |= _prefixed('keyframes/', self.keyframes.to_arrays())
+        arrays |= _prefixed('ground/', self.ground.to_arrays())
         if self.turned is not None:
             arrays |= _prefixed('turned/', self.turned.to_arrays())
         return arrays
@@ -213,6 +216,7 @@ class PlaceModel:
             MetricMap.from_arrays(_under(arrays, 'metric/')),
             panorama,
             Keyframes.from_arrays(_under(arrays, 'keyframes/'), panorama.sphere),
+            DrivenGround.from_arrays(_under(arrays, 'ground/')),
             TurnedMaps.from_arrays(turned) if turned else None,
             header['quality'],
             ErrorCorrelation(**header['error_correlation']),

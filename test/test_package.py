@@ -28,7 +28,7 @@ MODULES = {
 }
 ROS = {'rclpy', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',
        'lifecycle_msgs', 'nav_msgs', 'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'std_msgs',
-       'std_srvs', 'tf2_msgs'}  # fmt: skip
+       'std_srvs', 'tf2_msgs', 'visualization_msgs'}  # fmt: skip
 # The rooms: which other rooms each may import (always its own), and which packages beyond the
 # standard library. A module belongs to its folder, or is a room of its own; there is no
 # default, so a new one must be added here, and to the diagram of CONTRIBUTING.
@@ -57,7 +57,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'filtering': ({'data', 'fusion'}, {'numpy'}),
     'reports': ({'data', 'metric', 'training', 'inspection'}, {'numpy', 'matplotlib'}),
     'nodes': (
-        {'data', 'camera', 'fusion', 'place_model', 'observer', 'config'},
+        {'data', 'camera', 'fusion', 'metric', 'place_model', 'observer', 'config'},
         {'numpy', 'yaml'} | ROS,
     ),
     'config': (CORE | {'nodes'}, {'yaml'}),

@@ -68,3 +68,13 @@ class MetricConfig(Settings):
             raise ConfigError(f'start_pose: {self.start_pose} is not empty, and not x, y, yaw')
         if len(self.camera_xy) not in (0, 2):
             raise ConfigError(f'camera_xy: {self.camera_xy} is not empty, and not ahead, left')
+
+
+@dataclass(frozen=True, slots=True)
+class GroundConfig(Settings):
+    """The driven ground as a map of cells; by default lanes that are 1 m apart join."""
+
+    width: float = setting(
+        1.0, 'width of the robot with its margin', unit='m', low=0.05, high=100.0
+    )
+    cell: float = setting(0.05, 'size of a cell', unit='m', low=0.01, high=10.0)

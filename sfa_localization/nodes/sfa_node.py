@@ -11,8 +11,10 @@ from typing import Any, cast
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, QuaternionStamped
+from nav_msgs.msg import OccupancyGrid
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
 
 from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
 from sfa_localization.camera.watch import EXPLAINED_WARNING
@@ -20,6 +22,7 @@ from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.camera_clock import NEAR_NS
+from sfa_localization.metric.settings import GroundConfig
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.discovery import Discovery
 from sfa_localization.nodes.image_input import ImageInput
@@ -52,6 +55,8 @@ class SfaNode(LocalizationNode):
         self._uncertain = self.publisher(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
         latched = latched_qos()
         self._rig = self.publisher(String, 'sfa/rig', latched)
+        self._map = self.publisher(OccupancyGrid, 'sfa/map', latched)
+        self._paths = self.publisher(MarkerArray, 'sfa/map_paths', latched)
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
         self._declared: PanoramaConfig | None = None
@@ -64,7 +69,7 @@ class SfaNode(LocalizationNode):
         self.discovery = Discovery(self, self._topic, images.types, ['panorama'])
 
     def started(self) -> None:
-        self._publish_rig()
+        self._publish_map()
 
     def teardown(self) -> None:
         self._observer = None
@@ -97,18 +102,21 @@ class SfaNode(LocalizationNode):
         """Switch to another model; an unconfigured node loads its model when configured."""
         if self._observer is not None:
             self._observer.use(model)
-            self._publish_rig()
+            self._publish_map()
 
     def _reload(self, _: Any, response: Any) -> Any:
         self._use(self._load(self._config.model))
         response.success, response.message = True, f'loaded {self._config.model}'
         return response
 
-    def _publish_rig(self) -> None:
-        """Publish what ekf_node needs to know of the model."""
+    def _publish_map(self) -> None:
+        """Publish where the robot drove in training, and what ekf_node needs to know."""
         assert self._observer is not None
-        model = self._observer.model
+        model, frame = self._observer.model, self._config.map_frame
+        now_ns = self.get_clock().now().nanoseconds
         self._rig.publish(convert.to_rig(model.rig, model.error_correlation))
+        self._map.publish(convert.to_grid(model.ground.cells(GroundConfig()), now_ns, frame))
+        self._paths.publish(convert.to_lines(model.ground, now_ns, frame))
 
     def _receive_info(self, message: String) -> None:
         self._declared = convert.read_info(message)
