@@ -23,7 +23,7 @@ from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S
 from sfa_localization.bags.motion_arrays import to_yaw_rate
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
-from sfa_localization.bags.topic_stream import Stream
+from sfa_localization.bags.topic_stream import Stream, clock_offset
 from sfa_localization.camera import body, kinds
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.camera.settings import PanoramaConfig
@@ -37,6 +37,7 @@ from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
 from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
+from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.keyframes.closures import STRETCH_M, Textures, driven
 from sfa_localization.keyframes.leveling import tilt_pairs
 from sfa_localization.keyframes.texture import channels, quantized, texture
@@ -311,7 +312,18 @@ class _Survey:
             self._report.camera = kinds.CameraKind(*kinds.guess_geometry(alike), width, height)
         for stream in streams:
             if stream.topic == self._odometry and self._values[self._odometry]:
+                offsets = [self._by_clock_of(stream, other) for other in streams]
                 self._drive(stream)
+                if self._report.motion is not None:
+                    self._report.motion.corrected += filter(None, offsets)
+
+    def _by_clock_of(self, odometry: Stream, stream: Stream) -> str:
+        """Stamp images and yaw rates by the clock of the odometry; a sentence if theirs differs."""
+        name = {self._image: 'images', self._imu: 'gyroscope'}.get(stream.topic, '')
+        ahead_ns, text = clock_offset(name, stream, odometry) if name else (0, '')
+        values = self._values[stream.topic]
+        self._values[stream.topic] = [(stamp_ns - ahead_ns, value) for stamp_ns, value in values]
+        return text
 
     def _stream(self, name: str) -> Stream:
         if name == self._odometry:
@@ -391,7 +403,8 @@ class _Survey:
         rates = self._values.get(self._imu, [])
         gyro = to_yaw_rate(sorted(rates)) if rates else None
         is_panorama = camera is not None and camera.is_panorama
-        report.motion = check_motion(odometry, turns, gyro, is_panorama, views)
+        commands = OpenLoop.of(odometry.twists).repeats
+        report.motion = check_motion(odometry, turns, gyro, is_panorama, views, commands)
         report.bodies = self._bodies(sampled, stamps)
         near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
         places, broken = odometry.trajectory.at(near), report.motion.odometry

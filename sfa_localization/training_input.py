@@ -20,6 +20,7 @@ from sfa_localization.data.run import Run
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.data.statistics import evenly
 from sfa_localization.fusion.camera_clock import camera_clock
+from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.keyframes.closures import Textures, find_closures, views_of
 from sfa_localization.keyframes.leveling import leveled_runs
 from sfa_localization.keyframes.texture import channels
@@ -156,7 +157,8 @@ def compared(
         require_single_view(runs)
     images = [turns_and_textures(run.panoramas, recipe.panorama.clockwise) for run in runs]
     turns, textures = zip(*images, strict=True)
-    corrected, checks = check_drives(runs, turns, force, textures)
+    commands = [OpenLoop.of(run.odometry.twists).repeats for run in runs]
+    corrected, checks = check_drives(runs, turns, force, textures, commands)
     if recipe.segments.yaw_source == 'gyro':  # on request also a gyroscope that was rejected
         corrected = tuple(
             replace(run, yaw_rate=run.yaw_rate or recorded.yaw_rate)

@@ -54,9 +54,7 @@ def ended(process):
 
 
 def test_what_rclpy_cannot_handle_itself_ends_nothing(bench, start):
-    """Parameters of an unknown type, a negative clock, and transitions that do not fit: the rclpy of
-    Kilted answers the last.
-    """
+    """An unknown type, a negative clock, a transition that does not fit, which Kilted answers."""
     answers, process = [], start('ekf_node', '-p', 'use_sim_time:=true')
     for kind, service, request in (
         (ChangeState, 'change_state', ChangeState.Request(transition=Transition(id=1))),

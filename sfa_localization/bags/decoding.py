@@ -89,10 +89,28 @@ def pose_of(message: Any) -> tuple[float, float, float]:
     kind = message.__msgtype__
     if kind == FIX:
         return (*fix_of(message)[:2], 0.0)
-    if kind == 'geometry_msgs/msg/TransformStamped':
-        return read_planar(message.transform.translation, message.transform.rotation)
-    pose = message.pose if kind == 'geometry_msgs/msg/PoseStamped' else message.pose.pose
-    return read_planar(pose.position, pose.orientation)
+    return read_planar(*_position_and_orientation(message))
+
+
+def true_pose_of(message: Any) -> tuple[float, float, float]:
+    """The same of a ground truth: trackers and receivers without headings leave the quaternion at
+    zero, which counts as yaw 0.
+    """
+    if message.__msgtype__ == FIX:
+        return pose_of(message)
+    position, q = _position_and_orientation(message)
+    if any((q.x, q.y, q.z, q.w)):
+        return read_planar(position, q)
+    require_sane('pose', position.x, position.y)
+    return float(position.x), float(position.y), 0.0
+
+
+def _position_and_orientation(message: Any) -> tuple[Any, Any]:
+    if message.__msgtype__ == 'geometry_msgs/msg/TransformStamped':
+        return message.transform.translation, message.transform.rotation
+    stamped = message.__msgtype__ == 'geometry_msgs/msg/PoseStamped'
+    pose = message.pose if stamped else message.pose.pose
+    return pose.position, pose.orientation
 
 
 def place_of(message: Any) -> tuple[float, float, float]:

@@ -21,7 +21,7 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.satellite_fixes import in_plane
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.static_transforms import lever_arm
-from sfa_localization.bags.topic_stream import Stream
+from sfa_localization.bags.topic_stream import Stream, clock_offset
 from sfa_localization.camera.leveling import LeveledPanoramas, tilts_at
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
@@ -45,6 +45,9 @@ ODOMETRY_TOLERANCE_S = 0.5
 """An image is used when odometry before and after it is this near (s); poses are not interpolated
 over a longer pause."""
 _SAME_IMAGE_NS = 1_000_000  # stamps of one image differ by less
+# Uses of topics whose messages are sent when measured, in words.
+_STAMPED_AT_ONCE = {'images': 'images', 'imu': 'gyroscope', 'orientation': 'orientation',
+                    'ground_truth': 'ground truth'}  # fmt: skip
 logger = logging.getLogger(__name__)
 R = TypeVar('R', bound='ReadingRecipe')
 
@@ -155,9 +158,9 @@ def read_drive(
             streams |= _other_streams(bag, recipe, want_truth)
             values = _read(bag, streams, stored, progress)
             odometry = bag.to_odometry(streams['odometry'], values['odometry'])
-            stamps_ns, near_s = np.array(stored.stamps, np.int64), recipe.odometry_tolerance_s
-            covered = odometry.trajectory.covers(stamps_ns, int(near_s * 1e9))
-            _require_covered(streams['images'], covered, near_s)
+            stamps_ns = np.array(stored.stamps, np.int64) - _by_one_clock(bag, streams, values)
+            covered = odometry.trajectory.covers(stamps_ns, int(recipe.odometry_tolerance_s * 1e9))
+            _require_covered(streams['images'], covered, recipe.odometry_tolerance_s)
             panoramas: Panoramas = stored.finish(stamps_ns, covered)
             if recipe.camera.level_by_imu:
                 imu, tilts = streams['orientation'], values['orientation']
@@ -261,7 +264,7 @@ def _other_streams(bag: Bag, recipe: ReadingRecipe, want_truth: bool) -> dict[st
         streams['points'] = bag.stream(name, decoding.place_of)
     if want_truth:
         name = bag.find('ground_truth', topics.ground_truth)
-        streams['ground_truth'] = bag.stream(name, decoding.pose_of)
+        streams['ground_truth'] = bag.stream(name, decoding.true_pose_of)
     return streams
 
 
@@ -280,6 +283,21 @@ def _read(
             else:
                 values[uses[id(stream)]].append((stamp_ns, value))
     return values
+
+
+def _by_one_clock(bag: Bag, streams: dict[str, Stream], values: dict[str, StampedValues]) -> int:
+    """Stamp the values by the clock of the odometry, where their reception shows another one; log
+    it, and return by how much, ns, the stamps of the images are ahead of it.
+    """
+    images_ns = 0
+    for use, stream in streams.items():
+        if use in _STAMPED_AT_ONCE:
+            ahead_ns, text = clock_offset(_STAMPED_AT_ONCE[use], stream, streams['odometry'])
+            values[use] = [(stamp_ns - ahead_ns, value) for stamp_ns, value in values[use]]
+            images_ns = ahead_ns if use == 'images' else images_ns
+            if text:
+                logger.warning('%s: %s', bag.path, text)
+    return images_ns
 
 
 def _leveled(panoramas: Panoramas, imu: Stream, tilts: StampedValues, sphere: Sphere) -> Panoramas:

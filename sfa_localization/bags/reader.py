@@ -134,7 +134,7 @@ class Bag:
 
     def trajectory(self, topic: str = '') -> Trajectory:
         """All poses of a topic, by default of the true poses."""
-        stream = self.stream(self.find('ground_truth', topic), decoding.pose_of)
+        stream = self.stream(self.find('ground_truth', topic), decoding.true_pose_of)
         values = list(self._values(stream))
         if self.topics[stream.topic].kind == decoding.FIX:
             values = in_plane(values, values[0][1][:2])

@@ -17,7 +17,7 @@ from sensor_msgs.msg import CompressedImage, Imu
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import String
 
-from sfa_localization.camera.capture import Feed, opener
+from sfa_localization.camera.capture import Feed, FeedStatus, opener
 from sfa_localization.camera.leveling import leveled, tilts_at
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, CaptureConfig, PanoramaConfig
@@ -57,6 +57,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
 
     def _begin(self) -> None:
         self._feed: Feed | None = None
+        self._losses = 0
         self._listening_since_s: float | None = None
         self._images: ImageInput | None = None
         self._newest: deque[tuple[int, Image]] = deque(maxlen=1)
@@ -112,12 +113,18 @@ class OmnicamNode(lifecycle.LocalizationNode):
 
     def _follow_demand(self) -> None:
         if self._feed is not None:
-            self._feed.check()
+            self._report_loss(self._feed.check())
         elif not self._wanted():
             self._stop_listening()
         elif self._listening_since_s is None and self._images is not None:
             self._listening_since_s = steady_s()
             self._images.start(self._substitute)
+
+    def _report_loss(self, status: FeedStatus) -> None:
+        """Log and count each time that the source could not be opened, or was lost."""
+        if status.lost > self._losses:
+            self._losses = status.lost
+            self._reject(f'{"lost" if self._size else "cannot open"}: {status.problem}')
 
     def _take(self, topic: str) -> None:
         """Take images from a substitute for the input's topic, or again from that itself."""

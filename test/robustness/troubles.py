@@ -10,8 +10,10 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -19,14 +21,17 @@ import numpy as np
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores
 
-from sfa_localization.bags.decoding import typestore
+from sfa_localization.bags.decoding import FIX, IMAGE, typestore
+from sfa_localization.bags.writer import blank
 from sfa_localization.camera.encodings import decode_compressed, encode_jpeg
 from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.messages import read_yaw
 from sfa_localization.data.sphere import rotation
 
 TRAINING, TEST = Path('bags/sample'), Path('bags/sample_test')
 IMAGES, ODOMETRY, IMU, TRUTH = '/panorama/compressed', '/odom', '/imu', '/ground_truth'
 SECOND_NS = 1_000_000_000
+STORE = typestore(Stores.ROS2_JAZZY)
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,8 @@ class Trouble:
     """Whether the training drive has the trouble too."""
     options: tuple[str, ...] = ()
     """Of `train`."""
+    kinds: Mapping[str, str] = field(default_factory=dict)
+    """Types of topics that get others."""
     camera: str = ''
     """Parameters of omnicam_node, as YAML, for `train` and `evaluate`."""
 
@@ -60,20 +67,21 @@ def restamp(message, stamp_ns):
     message.header.stamp = type(stamp)(*(int(part) for part in divmod(stamp_ns, SECOND_NS)))
 
 
-def alter(source, target, changes, seed=0):
+def alter(source, target, changes, seed=0, kinds=types.MappingProxyType({})):
     """Write a bag with some of its messages changed; the order and times of reception stay."""
-    types, rng = typestore(Stores.ROS2_JAZZY), np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     with Reader(source) as bag, Writer(target, version=9, storage_plugin=StoragePlugin.MCAP) as out:
         topics = {
-            c.topic: out.add_connection(c.topic, c.msgtype, typestore=types)
+            c.topic: out.add_connection(c.topic, kinds.get(c.topic, c.msgtype), typestore=STORE)
             for c in bag.connections
         }
         for connection, received_ns, data in bag.messages():
             name, kind = connection.topic, connection.msgtype
-            message = types.deserialize_cdr(data, kind)
+            message = STORE.deserialize_cdr(data, kind)
             taken = changes[name](message, rng) if name in changes else None
             for part in [message] if taken is None else taken:
-                out.write(topics[name], received_ns, bytes(types.serialize_cdr(part, kind)))
+                part = STORE.serialize_cdr(part, topics[name].msgtype)
+                out.write(topics[name], received_ns, bytes(part))
 
 
 def run(*command):
@@ -96,7 +104,7 @@ def tried(name, folder, model):
             f'/**/omnicam_node: {{ros__parameters: {{{trouble.camera}}}}}', encoding='utf-8'
         )
     for source in (TRAINING, TEST) if trouble.trains else (TEST,):
-        alter(source, folder / source.name, trouble.changes())
+        alter(source, folder / source.name, trouble.changes(), kinds=trouble.kinds)
     training = folder / TRAINING.name if trouble.trains else TRAINING
     if trouble.trains:
         model = folder / 'model.npz'
@@ -105,8 +113,8 @@ def tried(name, folder, model):
             return text, None
     results = folder / 'results.json'
     test = folder / TEST.name
-    command = 'evaluate', model, test, '--align', training, '--json', results
-    code, said = run(*command, *parameters)
+    options = '--ground-truth-topic', TRUTH, '--align', training, '--json', results
+    code, said = run('evaluate', model, test, *options, *parameters)
     if code:
         return text + said, None
     errors = json.loads(results.read_text())
@@ -129,6 +137,110 @@ def lost(m, rng, share=0.05):
     if rng.random() < share:
         m.pose.position.x = m.pose.position.y = 0.0
         m.pose.orientation = type(m.pose.orientation)(0.0, 0.0, 0.0, 1.0)
+
+
+def ahead(topic, seconds):
+    """Changes that stamp a topic so many s ahead."""
+    return {topic: lambda m, _: restamp(m, stamp_of(m) + round(seconds * SECOND_NS))}
+
+
+def fast(topic, rate):
+    """Changes by a clock that gains `rate` s in each second since the first message."""
+    first = []
+
+    def change(m, _):
+        first.append(stamp_of(m))
+        restamp(m, first[0] + round((first[-1] - first[0]) * (1 + rate)))
+
+    return {topic: change}
+
+
+def following(lag_s):
+    """Changes by a camera that turns its images after the robot, with a lag."""
+    state = {}
+
+    def turned(m, _):
+        q, now = m.pose.pose.orientation, stamp_of(m)
+        yaw = 2 * np.arctan2(q.z, q.w)
+        before, shown = state.get('yaw', (now, yaw))
+        behind = (yaw - shown + np.pi) % (2 * np.pi) - np.pi
+        shown += behind * -np.expm1((before - now) / (lag_s * SECOND_NS))
+        state.update(yaw=(now, shown), behind=yaw - shown)
+
+    def roll(m, _):
+        image = cv2.imdecode(np.asarray(m.data), cv2.IMREAD_COLOR)
+        columns = round(-state.get('behind', 0.0) * image.shape[1] / (2 * np.pi))
+        m.data = cv2.imencode('.jpg', np.roll(image, columns, 1))[1].ravel()
+
+    return {ODOMETRY: turned, IMAGES: roll}
+
+
+def fixed(m, rng):
+    """A receiver of satellites, 50 degrees north, with corrections of a base station."""
+    east, north = np.array([m.pose.position.x, m.pose.position.y]) + rng.normal(0, 0.02, 2)
+    answer = blank(STORE, FIX)
+    answer.header, answer.position_covariance_type = m.header, 2
+    answer.position_covariance[[0, 4]] = 0.02**2
+    answer.latitude, answer.longitude = 50 + north / 111_229.0, 8 + east / 71_695.8
+    return [answer]
+
+
+def unpacked(m, _):
+    """A driver that leaves out the step of raw images."""
+    image = decode_compressed(m.data)
+    answer = blank(STORE, IMAGE)
+    answer.header, answer.encoding, answer.data = m.header, 'bgr8', image.ravel()
+    answer.height, answer.width = image.shape[:2]
+    return [answer]
+
+
+def paused(begin_s=55, end_s=80):
+    """A recording that paused while the robot drove on, and odometry that started anew."""
+    times, starts = [], []
+
+    def seconds(m):
+        times.append(stamp_of(m))
+        return (times[-1] - times[0]) / SECOND_NS
+
+    def kept(m, _):
+        return [] if begin_s < seconds(m) < end_s else [m]
+
+    def started_anew(m, _):
+        pose, driven_s = m.pose.pose, seconds(m)
+        if driven_s < end_s:
+            return [m] if driven_s <= begin_s else []
+        yaw, place = read_yaw(pose.orientation), pose.position.x + 1j * pose.position.y
+        starts.append((yaw, place))
+        yaw, place = yaw - starts[0][0], (place - starts[0][1]) * np.exp(-1j * starts[0][0])
+        pose.position.x, pose.position.y = place.real, place.imag
+        pose.orientation.z, pose.orientation.w = np.sin(yaw / 2), np.cos(yaw / 2)
+        return [m]
+
+    return dict.fromkeys((IMAGES, IMU, TRUTH), kept) | {ODOMETRY: started_anew}
+
+
+def cut_off(m, rng, share=0.125):
+    """A camera that loses bytes in the middle of some JPEGs."""
+    if rng.random() < share:
+        first = int(len(m.data) * rng.uniform(0.25, 0.6))
+        m.data = np.delete(m.data, slice(first, first + len(m.data) // 4))
+
+
+def as_video(key_every=30):
+    """A driver that publishes H.264, with a key frame every few images."""
+    import av
+
+    encoder = av.CodecContext.create('libx264', 'w')
+    encoder.options = {'tune': 'zerolatency', 'crf': '18', 'g': str(key_every)}
+    encoder.pix_fmt, encoder.time_base = 'yuv420p', Fraction(1, 10)
+    encoder.width, encoder.height = 600, 60
+
+    def encode(m, _):
+        frame = av.VideoFrame.from_ndarray(decode_compressed(m.data), format='bgr24')
+        packets = encoder.encode(frame.reformat(format='yuv420p'))
+        m.format, m.data = 'h264', np.frombuffer(b''.join(map(bytes, packets)), np.uint8)
+
+    return encode
 
 
 def seen(change):
@@ -184,6 +296,38 @@ TROUBLES = {
         lambda: {TRUTH: lambda m, _: restamp(m, stamp_of(m) + 300_000_000)},
         RIGHT_M, 'ground truth.* 0.30 s late', trains=False,
     ),
+    'images: TAI': Trouble(
+        lambda: ahead(IMAGES, 37), RIGHT_M, r'images: stamped 37\.0 s ahead .* in TAI'
+    ),
+    'odometry: GPS time': Trouble(
+        lambda: ahead(ODOMETRY, 18), RIGHT_M, r'images: stamped 18\.0 s behind .*/odom in GPS time'
+    ),
+    'images: an hour behind': Trouble(
+        lambda: ahead(IMAGES, -3600.4), RIGHT_M, r'images: stamped 3600\.4 s behind'
+    ),
+    'images: 0.3 % fast': Trouble(
+        lambda: fast(IMAGES, 0.003), RIGHT_M, r'images: their clock runs 0\.30 % fast'
+    ),
+    'odometry: 0.5 % slow': Trouble(
+        lambda: fast(ODOMETRY, -0.005), (0.1, 0.1), r'odometry: its clock runs 0\.50 % slow'
+    ),
+    'images follow the turns': Trouble(
+        lambda: following(0.5), None, "images follow the robot's turns with a lag of 0.5 s"
+    ),
+    'points: fixes of a receiver': Trouble(
+        lambda: {TRUTH: fixed}, (0.06, 0.07), 'latitude .*, longitude .* is the origin',
+        options=('--points-topic', TRUTH), kinds={TRUTH: FIX},
+    ),
+    'images: step left out': Trouble(
+        lambda: {IMAGES: unpacked}, RIGHT_M, 'images: 140 used', kinds={IMAGES: IMAGE},
+    ),
+    'odometry: starts anew after a pause': Trouble(
+        paused, (0.1, 0.1), 'odometry pauses once, first after 55.0 s',
+    ),
+    'images: JPEGs cut off': Trouble(
+        lambda: {IMAGES: cut_off}, RIGHT_M, 'images: .* cut-off JPEG'
+    ),
+    'images: H.264': Trouble(lambda: {IMAGES: as_video()}, RIGHT_M, 'images: 140 used'),
     'body behind, a quarter': Trouble(
         lambda: body(0.25), (1.0, 1.0), r'shows the robot: set blind_sectors: \[1[23].*, 2[34]'
     ),
