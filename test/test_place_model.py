@@ -128,9 +128,10 @@ def test_a_model_is_the_same_after_it_was_saved(model, saved, pictures, tmp_path
 def test_a_model_masks_what_it_has_not_seen_in_training(model, pictures, tmp_path):
     """Whoever gives it panoramas: masked or not, they show the same."""
     camera = Unwrapper(CameraConfig(blind_sectors=(150.0, 210.0)), model.panorama)
-    masked = replace(model, repeated=camera.repeated)
+    masked = replace(model, repeated=camera.repeated, mount_rpy=(5.0, 0.0, 30.0))
     masked.save(tmp_path / 'masked.npz')
     masked = PlaceModel.load(tmp_path / 'masked.npz')
+    assert masked.mount_rpy == (5.0, 0.0, 30.0)
     covered, blind = pictures[:2].copy(), ~camera.visible((1, 4))
     covered[:, blind] = 200
     expected = model.locate_all(np.stack([camera(picture) for picture in pictures[:2]]))
