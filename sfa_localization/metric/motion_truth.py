@@ -197,17 +197,19 @@ class _Comparison:
         behind = int(np.argmax(product)) - len(by_wheels) + 1
         return float(self.seconds[0] - self.track_s[0]) + 4 * _STEP_S * behind
 
-    def fitted(self, mirrored: bool, theta: Array, free: Mask, rows: Indices) -> _Fit | None:
-        """Start at theta (5,), and change its `free` values; None without enough motion."""
-        at = self.seconds[rows] - theta[2]
-        rows = rows[(at >= self.track_s[0]) & (at <= self.track_s[-1])]
+    def fitted(
+        self, mirrored: bool, theta: Array, free: Mask, rows: Indices, about_s: float
+    ) -> _Fit | None:
+        """Start at theta (5,), and change its `free` values, in windows for a delay of about so
+        much; None without enough motion.
+        """
+        at = self.seconds[rows] - about_s
+        inside = (at >= self.track_s[0]) & (at <= self.track_s[-1])
+        rows, at = rows[inside], at[inside]
         if self.used[rows].sum() < 3 * WINDOWS_MIN:
             return None
-        at = self.seconds[rows] - theta[2]
-        way, after = (
-            np.interp(at, self.track_s, self.way),
-            np.searchsorted(self.track_s, at, 'right'),
-        )
+        way = np.interp(at, self.track_s, self.way)
+        after = np.searchsorted(self.track_s, at, 'right')
         windows = _Windows.of(np.column_stack([way // self.window_m, self.track.part[after - 1]]))
         used, each = self.used[rows], len(rows) / len(windows.first)
         weight, std = used + 1e-6, NOISE_M
@@ -270,7 +272,7 @@ class _Comparison:
         rows, chosen = evenly(len(self.seconds), _SAMPLES), []
         for mirrored in (False, True):
             starts = [np.array([0.0, 0.0, s, 0.0, 0.0]) for s in shifts_s]
-            fits = [self.fitted(mirrored, start, free, rows) for start in starts]
+            fits = [self.fitted(mirrored, start, free, rows, start[2]) for start in starts]
             chosen.append(
                 min((fit for fit in fits if fit), key=lambda fit: fit.cost(FAULT_M), default=None)
             )
@@ -284,11 +286,11 @@ class _Comparison:
         steps = np.diff(self.way)
         speed = float((steps**2 / np.diff(self.track_s)).sum() / max(steps.sum(), 1e-9))
         least_s = max(LATE_S, WAY_MIN_M / speed)
-        rows = np.arange(len(self.seconds))
+        rows, about_s = np.arange(len(self.seconds)), float(fit.theta[2])
 
         def refitted(free: Mask) -> _Fit:
             theta = np.where(free, fit.theta, 0.0)
-            return self.fitted(fit.mirrored, theta, free, rows) or fit
+            return self.fitted(fit.mirrored, theta, free, rows, about_s) or fit
 
         fit = refitted(free)
         for _ in range(2):
