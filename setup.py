@@ -83,9 +83,9 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            f'{NAME} = {NAME}.cli:main',
-            *(f'{command} = {NAME}.cli:executable' for command in COMMANDS if IN_WORKSPACE),
-            *(f'{node} = {NAME}.nodes.entry:{node}' for node in NODES),
+            f'{NAME} = {NAME}.__main__:main',
+            *(f'{command} = {NAME}.__main__:executable' for command in COMMANDS if IN_WORKSPACE),
+            *(f'{node} = {NAME}.__main__:executable' for node in NODES),
         ],
     },
 )

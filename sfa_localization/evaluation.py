@@ -158,17 +158,22 @@ def evaluate(
         aligned_on = ', '.join(map(str, align_bags or [bag]))
         transform = fit_transform(*((d.truth, d.images) for d in training_drives or [drive]))
     estimates = drive.estimates(transform)
-    scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
-    turn = rotation(transform.yaw_rad)
-    for name, track in drive.tracks.items():
-        scores[name] |= calibration(drive.truth, estimates[name], turn, track.covariances)
-        scores[name]['similarity'] = similarity(drive.truth, estimates[name])
+    scores = _scores(drive, estimates, rotation(transform.yaw_rad))
     counts = {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])}
     drives = *training_drives, drive
     corrections = tuple(f'{d.run.name}: {text}' for d in drives for text in d.sentences)
     return Evaluation(
         drive.truth, estimates, scores, counts, drive.features, aligned_on, transform, corrections
     )
+
+
+def _scores(drive: _Localized, estimates: Mapping[str, Trajectory], turn: Array) -> Scores:
+    """Errors and calibration of the estimates; `turn` (2, 2) leads from the map to the truth."""
+    scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
+    for name, track in drive.tracks.items():
+        scores[name] |= calibration(drive.truth, estimates[name], turn, track.covariances)
+        scores[name]['similarity'] = similarity(drive.truth, estimates[name])
+    return scores
 
 
 def observed(

@@ -299,3 +299,12 @@ def test_a_folder_of_pictures_in_order_of_their_names(bench, tmp_path):
     assert stamps == sorted(stamps) and stamps[0] > 10**18
     (reason,) = node.monitors[str(tmp_path)].refused
     assert 'c.png' in reason
+
+
+def test_a_source_that_is_not_there_is_logged(bench, tmp_path, capfd):
+    path = str(tmp_path / 'missing')
+    node = bench.run(OmnicamNode, source='folder', source_path=path)
+    why = f'cannot open: folder {path} is missing'
+    assert until(lambda: node.monitors[path].refused == {why: 1})
+    bench.do(lambda: None)  # the callback that counts it has ended
+    assert f'{path}: {why}' in capfd.readouterr().err

@@ -60,6 +60,22 @@ def test_prediction_to_a_stamp_recalls_and_extrapolates_less_and_less_sure():
     assert np.isfinite(later[-1].covariance).all() and later[-1].pose[0] < 6.5
 
 
+def test_a_forgotten_pose_may_be_anywhere_and_what_was_learned_of_the_robot_stays():
+    config, drive = FilterConfig(initial_pose=(0.0, 0.0, 0.0)), FilterDrive(seconds=60, **NOISY)
+    fused = PoseFilter(config)
+    fused.forget_pose()
+    fused.add_odometry(START_NS - 10**8, 0.0, 0.0)
+    assert fused.state is None, 'nor does it start at the configured pose'
+    drive.feed(fused, heading=True, stop=40)
+    before = fused.state
+    fused.forget_pose()
+    assert fused.state is None and fused.status.level is Level.UNINITIALISED
+    drive.kidnap(399, (8.0, -3.0, 2.0))
+    ((_, update, error, _),) = drive.feed(fused, heading=True, start=40, stop=40.05)
+    assert update.reason == 'started' and error < 0.6
+    assert np.array_equal(fused.state.mean[5:9], before.mean[5:9])
+
+
 # Time.
 
 

@@ -153,7 +153,7 @@ def read_drive(
     with Bag(path, strict=strict, config=recipe.bag) as bag:
         name = bag.find('image', recipe.topics.image)
         try:
-            stored = _PanoramaFile(Path(cache), recipe)
+            stored = _PanoramaFile(Path(cache), recipe, _is_ready(bag, name))
             streams = {'images': bag.stream(name, stored.panorama)}
             streams |= _other_streams(bag, recipe, want_truth)
             values = _read(bag, streams, stored, progress)
@@ -194,27 +194,40 @@ def _measured(
     return origin, to_points(values['points'], lever or 0j)
 
 
+def _is_ready(bag: Bag, topic: str) -> bool:
+    """Whether images are those of omnicam_node, which also publishes their geometry: it has mounted
+    and masked the camera.
+    """
+    return f'{topic.removesuffix("/compressed")}/info' in bag.topics
+
+
 class _PanoramaFile:
     """Makes panoramas of one size, and stores them in a temporary file."""
 
-    def __init__(self, folder: Path, recipe: ReadingRecipe) -> None:
+    def __init__(self, folder: Path, recipe: ReadingRecipe, is_ready: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as the run
         self._unwrap = Unwrapper(recipe.camera, recipe.panorama)
+        self._unwrap.check()
+        if is_ready:
+            masked = CameraConfig(blind_sectors=recipe.camera.blind_sectors)
+            self._unwrap = Unwrapper(masked, recipe.panorama)
         self._watch = FrozenWatch() if recipe.distinct else None
         self.stamps: list[int] = []
         self._shape: tuple[int, ...] = ()
 
     def panorama(self, image: Image) -> Image:
         """The panorama of a camera's image. Raises LocalizationError."""
-        if not looks_like_panorama(*image.shape[:2]):
-            image = self._unwrap(image)
+        if looks_like_panorama(*image.shape[:2]):
+            if not self._shape:
+                self._unwrap = self._unwrap.keeping_size((image.shape[0], image.shape[1]))
+            elif image.shape != self._shape:
+                height, width = self._shape[:2]
+                raise MessageError(f'size is not {width}x{height} like the first image')
+        image = self._unwrap(image)
         if self._watch is not None and not self._watch.add(image):
             raise MessageError('image repeats the one before')
         self._shape = self._shape or image.shape
-        if image.shape != self._shape:
-            height, width = self._shape[:2]
-            raise MessageError(f'size is not {width}x{height} like the first image')
         return image
 
     def add(self, stamp_ns: int, image: Image) -> None:

@@ -75,6 +75,16 @@ class Settings:
             raise ConfigError(f'{where}: {error}') from None
 
 
+def require_pose(name: str, pose: tuple[float, ...]) -> None:
+    """Raise ConfigError for a pose that is neither empty nor x (m), y (m) and yaw (rad)."""
+    if len(pose) not in (0, 3):
+        raise ConfigError(
+            f'{name}: {len(pose)} numbers given; give x (m), y (m) and yaw (rad), or none'
+        )
+    if pose and abs(pose[2]) > 2 * math.pi:
+        raise ConfigError(f'{name}: a yaw of {pose[2]:g} rad is more than a turn: give radians')
+
+
 def nearest(name: str, names: Collection[str]) -> str:
     """The end of a message about an unknown name: the most similar of the names, or ''."""
     close = difflib.get_close_matches(name[:100], sorted(names), n=1)

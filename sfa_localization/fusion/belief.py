@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.rig import Quantity
-from sfa_localization.fusion.motion import State, Twist
+from sfa_localization.fusion.motion import Pace, State, Twist
 
 Pose = tuple[float, float, float]
 """x m, y m, yaw rad."""
@@ -217,6 +217,7 @@ class Belief(NamedTuple):
     odometry: Odometer
     memory: Memory
     path: DrivenPath = DrivenPath()
+    pace: Pace = Pace()
 
     @property
     def state(self) -> State | None:

@@ -20,7 +20,7 @@ ODOMETRY_TIMEOUT_S, COAST_S = 0.5, 2.0
 """Odometry silent for longer is a gap: many times the period of any odometry. The last speed is
 assumed to go on for 2 s: about how long robots keep a speed."""
 _LEARNING, _LEAST_NOISE = 0.1, 1e-3  # relative change per message of the steps' noise; m or rad
-_LONGEST_S = math.pi / motion.UNKNOWN_RATE  # of a silence after which any heading is possible
+_LONGEST_S = 2 * math.pi  # of a silence: at half a radian a second any heading is possible
 _JUMP = 0.05  # m or rad: motion beyond twice the speed by more took longer than stamps say
 _ROUNDED_M = 2e-3  # a pose moves less sideways by its rounding
 

@@ -24,8 +24,10 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.belief import (
     Belief,
+    DrivenPath,
     Event,
     MeasurementEvent,
+    Memory,
     OdometryEvent,
     PoseEvent,
     Update,
@@ -131,6 +133,13 @@ class PoseFilter:
             stamp_ns = newest
         event = PoseEvent(int(stamp_ns), value, checked)
         self._history.add((event.stamp_ns, POSE), event)
+
+    def forget_pose(self) -> None:
+        """The robot may be anywhere; what is estimated of its camera and odometry stays."""
+        self.counts['pose forgotten'] += 1
+        self._waiting, belief = None, self._history.newest
+        path = belief.path._replace(placed_m=DrivenPath().placed_m)
+        self._go_on(belief._replace(located=False, memory=Memory(), path=path))
 
     def add_odometry(
         self,

@@ -62,7 +62,7 @@ class Discovery:
             (name, kind)
             for kind in self._types
             for name, kinds in sorted(self._node.get_topic_names_and_types())
-            if kind in kinds and self._publishers(name) - this_node
+            if kind in kinds and self._publishers(name) - this_node and self._is_offered(name)
         ]
         usable = [n for n, kind in topics if kind == self._types[0] and self._qualifies(n)]
         if self._take is not None and len(usable) == 1:
@@ -87,8 +87,15 @@ class Discovery:
         spaces = {f'{space}/' for _, space in self._node.get_node_names_and_namespaces()}
         others = tuple(space for space in spaces if len(space) > len(below))
         usual = name.startswith(below) and not name.startswith(others)
+        return usual and not self._is_output(name)
+
+    def _is_offered(self, name: str) -> bool:
+        """Whether an argument of the launch file takes a topic: panoramas are also an input."""
+        return 'panorama' in self._arguments or not self._is_output(name)
+
+    def _is_output(self, name: str) -> bool:
         ours = {node for node, _ in self._publishers(name)} & {*NODES, self._node.get_name()}
-        return usual and not name.endswith(_OUTPUTS) and not ours
+        return bool(ours) or name.endswith(_OUTPUTS)
 
     def _publishers(self, name: str) -> set[tuple[str, str]]:
         infos = self._node.get_publishers_info_by_topic(name)

@@ -17,9 +17,10 @@ from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Empty, SetBool, Trigger
 
 from sfa_localization.data.errors import MessageError
+from sfa_localization.data.files import require_outputs
 from sfa_localization.data.geometry import Array, compose, invert
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.belief import Pose
@@ -37,6 +38,10 @@ try:
     from tf2_msgs.msg import TFMessage
 except ImportError:  # the pip wheels of ROS have none
     TFMessage = None
+try:
+    from nav2_msgs.srv import SetInitialPose
+except ImportError:  # without Nav2 nobody calls it
+    SetInitialPose = None
 
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 _LEVELS = dict(zip(Level, (_WARN, _OK, _WARN, _ERROR), strict=True))
@@ -76,6 +81,8 @@ class EkfNode(LocalizationNode):
 
     def setup(self) -> None:
         self._begin()
+        if self._config.pose_file:
+            self.attempt('pose_file', require_outputs, [FilePath(self._config.pose_file)], [])
         self.attempt('pose_file', self._restore_pose)
         self._make_publishers()
         self._subscribe_odometry()
@@ -95,6 +102,11 @@ class EkfNode(LocalizationNode):
             self.subscribe(pose, topic, self._set_pose, QoSProfile(depth=1))
         self.service(Trigger, '~/reset', self._reset)
         self.service(SetBool, '~/pause', self._pause)
+        # The services of nav2_amcl, by its names.
+        self.order(Empty, 'reinitialize_global_localization', self._forget_pose)
+        if SetInitialPose is not None:
+            take_pose = self._set_pose
+            self.order(SetInitialPose, 'set_initial_pose', lambda given: take_pose(given.pose))
         self.every(_WATCH_PERIOD_S, self._publish_state)
         self.every(SAVE_PERIOD_S, self._save_pose)
         # A bag played in a loop steps simulated time back, before the stamps of messages do.
@@ -199,6 +211,12 @@ class EkfNode(LocalizationNode):
         self._publish_state()
         response.success, response.message = True, self.status().level.name
         return response
+
+    def _forget_pose(self, _: Any) -> None:
+        self.filter.forget_pose()
+        self._reliable = None
+        self.get_logger().info('pose forgotten: images show where the robot is')
+        self._publish_state()
 
     def _pause(self, request: Any, response: Any) -> Any:
         self._paused = bool(request.data)

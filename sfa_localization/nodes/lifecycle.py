@@ -198,6 +198,19 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         service = self.create_service(kind, name, answer)
         self._entities[service] = self.destroy_service
 
+    def order(self, kind: Any, name: str, callback: Callable[[Any], None]) -> None:
+        """A service with an empty answer: a request is counted, and rejected, as a message is."""
+
+        def answer(request: Any, response: Any) -> Any:
+            if self.active:
+                self.take(name, callback, request)
+            else:
+                self.refuse(name, 'this node is not active')
+            return response
+
+        service = self.create_service(kind, name, answer)
+        self._entities[service] = self.destroy_service
+
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call at a steady period: simulated time may stop, and wall time may step back."""
         name = f'timer {callback.__name__.strip("_")}'

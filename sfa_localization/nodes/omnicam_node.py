@@ -17,7 +17,7 @@ from sensor_msgs.msg import CompressedImage, Imu
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import String
 
-from sfa_localization.camera.capture import Feed, opener
+from sfa_localization.camera.capture import Feed, FeedStatus, opener
 from sfa_localization.camera.leveling import leveled, tilts_at
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, CaptureConfig, PanoramaConfig
@@ -57,6 +57,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
 
     def _begin(self) -> None:
         self._feed: Feed | None = None
+        self._losses = 0
         self._listening_since_s: float | None = None
         self._images: ImageInput | None = None
         self._newest: deque[tuple[int, Image]] = deque(maxlen=1)
@@ -66,7 +67,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
     # Life cycle.
 
     def setup(self) -> None:
-        self._build_tables(self._unwrapper)
+        self._unwrapper.check(self._size)
         self._frozen = FrozenWatch()
         self._panoramas = self.publisher(ImageMessage, 'panorama', 2)
         compressed = self.following('panorama/compressed')
@@ -112,12 +113,18 @@ class OmnicamNode(lifecycle.LocalizationNode):
 
     def _follow_demand(self) -> None:
         if self._feed is not None:
-            self._feed.check()
+            self._report_loss(self._feed.check())
         elif not self._wanted():
             self._stop_listening()
         elif self._listening_since_s is None and self._images is not None:
             self._listening_since_s = steady_s()
             self._images.start(self._substitute)
+
+    def _report_loss(self, status: FeedStatus) -> None:
+        """Log and count each time that the source could not be opened, or was lost."""
+        if status.lost > self._losses:
+            self._losses = status.lost
+            self._reject(f'{"lost" if self._size else "cannot open"}: {status.problem}')
 
     def _take(self, topic: str) -> None:
         """Take images from a substitute for the input's topic, or again from that itself."""
@@ -181,7 +188,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def check(self, settings: Current) -> None:
         """Raises LocalizationError for a mask, sector, mount or elevation that hides all."""
         if any(settings[kind] != self._settings[kind] for kind in (CameraConfig, PanoramaConfig)):
-            self._build_tables(self._new_unwrapper(settings))
+            self._new_unwrapper(settings).check(self._size)
 
     def settings_changed(self, settings: Settings) -> None:
         if isinstance(settings, CaptureConfig) and self._feed is not None:
@@ -195,13 +202,6 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def _new_unwrapper(settings: Current) -> Unwrapper:
         camera, panorama = settings[CameraConfig], settings[PanoramaConfig]
         return Unwrapper(cast(CameraConfig, camera), cast(PanoramaConfig, panorama))
-
-    def _build_tables(self, unwrapper: Unwrapper) -> None:
-        """Build the tables for the images' size, if an image or the calibration gives it."""
-        lens = unwrapper.calibration if unwrapper.model else None
-        size = self._size or (lens and (lens.image_height, lens.image_width)) or (0, 0)
-        if lens and 0 not in size:
-            unwrapper.visible(size)
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         details = {'camera model': self._unwrapper.model}
@@ -236,9 +236,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
             return _WARN, f'the camera has repeated its last image for {frozen_s:.0f} s'
         if monitor.received and not monitor.used:
             return _ERROR, 'no image could be used so far'
-        visible = 1.0
-        if self._size is not None and not self._unwrapper.is_panorama(self._size):
-            visible = float(self._unwrapper.visible(self._size).mean())
+        visible = 1.0 if self._size is None else self._unwrapper.visible(self._size).mean()
         details['panorama visible [%]'] = f'{100 * visible:.0f}'
         if visible < _LITTLE_VISIBLE:
             return _WARN, f'the camera sees only {100 * visible:.0f} % of the panorama'
