@@ -162,8 +162,7 @@ def check_motion(
     repeats `commands` is followed by the robot.
     """
     check = MotionCheck([], odometry, gyro, [*_impossible(sources_of(odometry, images, gyro))])
-    impossible = bool(check.wrong)
-    if not impossible:
+    if not (impossible := bool(check.wrong)):
         images = _repaired(check, images)
     sources = sources_of(check.odometry, images, check.gyro)
     pairs = [compare(a, b, what) for what in ('turns', 'way') for a, b in combinations(sources, 2)]
