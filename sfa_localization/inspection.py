@@ -388,7 +388,11 @@ class _Survey:
     def _drive(self, stream: Stream) -> None:
         """Fill in the path, the tilt, and the comparison with images and gyroscope."""
         report, camera = self._report, self._report.camera
-        odometry = self._bag.to_odometry(stream, self._values[self._odometry])
+        try:
+            odometry = self._bag.to_odometry(stream, self._values[self._odometry])
+        except BagError as error:
+            report.lacks.append(str(error).removeprefix(f'{self._bag.path}: '))
+            return
         images = self._values.get(self._image, [])
         stamps = np.array([stamp for stamp, _ in images], np.int64)
         yaw = np.array([yaw for _, (yaw, _) in images], float)
