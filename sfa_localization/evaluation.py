@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -48,7 +49,8 @@ from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
 from sfa_localization.localizer import Localizer
 from sfa_localization.metric.dead_reckoning import OdometryTrack
-from sfa_localization.metric.motion_check import check_motion
+from sfa_localization.metric.motion_check import MotionCheck, check_motion
+from sfa_localization.metric.motion_clocks import Drift
 from sfa_localization.metric.motion_truth import TruePoses, true_poses
 from sfa_localization.metric.settings import SegmentConfig
 from sfa_localization.observer import Observation, Observer
@@ -57,6 +59,7 @@ from sfa_localization.training import Recipe
 
 logger = logging.getLogger(__name__)
 Scores = dict[str, dict[str, Any]]
+_CLOCK_OR_FOLLOWING = re.compile('clock runs|^images follow')
 _TRUTH_TOLERANCE_NS = 500_000_000
 WRONG_M = 1.0
 """Position error from which a filter that says LOCALISED is wrong."""
@@ -101,6 +104,8 @@ class _Localized:
     features: Array
     localised: Mask
     counts: dict[str, Any]
+    sentences: tuple[str, ...]
+    """What was corrected, of the truth and of clocks, and how images follow the robot."""
 
     @property
     def truth(self) -> Trajectory:
@@ -153,17 +158,22 @@ def evaluate(
         aligned_on = ', '.join(map(str, align_bags or [bag]))
         transform = fit_transform(*((d.truth, d.images) for d in training_drives or [drive]))
     estimates = drive.estimates(transform)
-    scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
-    turn = rotation(transform.yaw_rad)
-    for name, track in drive.tracks.items():
-        scores[name] |= calibration(drive.truth, estimates[name], turn, track.covariances)
-        scores[name]['similarity'] = similarity(drive.truth, estimates[name])
+    scores = _scores(drive, estimates, rotation(transform.yaw_rad))
     counts = {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])}
     drives = *training_drives, drive
-    corrections = tuple(f'{d.run.name}: {text}' for d in drives for text in d.true.sentences)
+    corrections = tuple(f'{d.run.name}: {text}' for d in drives for text in d.sentences)
     return Evaluation(
         drive.truth, estimates, scores, counts, drive.features, aligned_on, transform, corrections
     )
+
+
+def _scores(drive: _Localized, estimates: Mapping[str, Trajectory], turn: Array) -> Scores:
+    """Errors and calibration of the estimates; `turn` (2, 2) leads from the map to the truth."""
+    scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
+    for name, track in drive.tracks.items():
+        scores[name] |= calibration(drive.truth, estimates[name], turn, track.covariances)
+        scores[name]['similarity'] = similarity(drive.truth, estimates[name])
+    return scores
 
 
 def observed(
@@ -175,7 +185,7 @@ def observed(
     """
     run = _read(bag, recipe, progress, want_truth)
     if want_truth:
-        true = _true_poses(run, list(headings(run.panoramas)))
+        _, true = _compared(run, list(headings(run.panoramas)))
         for text in true.sentences:
             logger.warning('%s: %s', run.name, text)
         run = replace(run, ground_truth=true.poses)
@@ -207,27 +217,28 @@ def _read(bag: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Run:
     return run
 
 
-def _true_poses(run: Run, turns: Sequence[float]) -> TruePoses:
-    """The poses of base_link by the ground truth, which is compared with the odometry; `turns` are
-    the headings of the images. Raises DataError for the truth of another drive.
+def _compared(run: Run, turns: Sequence[float]) -> tuple[MotionCheck, TruePoses]:
+    """The comparison of the sources of motion, and the poses of base_link by the ground truth, as
+    compared with the odometry; `turns` are the headings of the images. Raises DataError for the
+    truth of another drive.
     """
     assert run.ground_truth is not None
     images = run.panoramas.stamps_ns, np.array(turns)
-    check = check_motion(run.odometry, images, run.yaw_rate)
-    track = OdometryTrack.of(check.odometry, SegmentConfig(), check.gyro)
     open_loop = OpenLoop.of(run.odometry.twists).repeats
+    check = check_motion(run.odometry, images, run.yaw_rate, commands=open_loop)
+    track = OdometryTrack.of(check.odometry, SegmentConfig(), check.gyro)
     try:
         true = true_poses(run.ground_truth, track, check.confirmed, open_loop)
     except DataError as error:
         raise DataError(f'{run.name}: {error}') from None
-    return true
+    return check, true
 
 
 def _localized(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Localized:
     """Run model and filter over a bag. Raises BagError or DataError."""
     run, fused = _read(bag, recipe, progress), localizer.filter
     turns = list(headings(run.panoramas))
-    true = _true_poses(run, turns)
+    check, true = _compared(run, turns)
     observations, levels = list[Observation](), dict[int, Level]()
     states, localised = list[State](), list[bool]()
     images = run.panoramas.stamps_ns, _observations(run, localizer.observer, progress)
@@ -244,13 +255,16 @@ def _localized(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) 
         raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
     clock = camera_clock(run.odometry, run.panoramas.stamps_ns, turns)
     counts = _counts(run, observations, levels, fused, clock)
+    late = check.image_drift or Drift(0, clock.delay_ns * 1e-9, 0.0)
     if OpenLoop.of(run.odometry.twists).repeats:  # the robot is late, not the images
-        clock = CameraClock()
-    tracks = {'sfa': _track(usable, clock), 'ekf': FilterTrack.of(states)}
+        late = Drift(0, 0.0, 0.0)
+    tracks = {'sfa': _track(usable, late), 'ekf': FilterTrack.of(states)}
     if isinstance(fused, Smoother):
         tracks['smoothed'] = FilterTrack.of(fused.smoothed())
     features = np.array([observation.slow_features for observation in usable])
-    return _Localized(run, true, tracks, features, np.array(localised, bool), counts)
+    said = [text for text in check.corrected + check.wrong if _CLOCK_OR_FOLLOWING.search(text)]
+    sentences = (*said, *true.sentences)
+    return _Localized(run, true, tracks, features, np.array(localised), counts, sentences)
 
 
 def _counts(
@@ -284,9 +298,10 @@ def _seconds_since_last(stamps_ns: Stamps) -> Array:
     return np.minimum(np.diff(stamps_ns, prepend=stamps_ns[:1]) * 1e-9, COAST_S)
 
 
-def _track(usable: Sequence[Observation], clock: CameraClock) -> FilterTrack:
+def _track(usable: Sequence[Observation], clock: Drift) -> FilterTrack:
     """The poses of single images, at the times when they were taken by `clock`."""
-    stamps = np.array([image.stamp_ns for image in usable], np.int64) - clock.delay_ns
+    stamps = np.array([image.stamp_ns for image in usable], np.int64)
+    stamps -= clock.late_ns(stamps)
     poses = np.array([[*image.position, image.yaw] for image in usable])
     return FilterTrack(Trajectory(stamps, poses), np.array([image.covariance for image in usable]))
 

@@ -23,8 +23,8 @@ from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S
 from sfa_localization.bags.motion_arrays import to_yaw_rate
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
-from sfa_localization.bags.topic_stream import Stream
-from sfa_localization.camera import kinds
+from sfa_localization.bags.topic_stream import Stream, clock_offset
+from sfa_localization.camera import body, kinds
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import VisualGyro
@@ -37,9 +37,10 @@ from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
 from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
+from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.keyframes.closures import STRETCH_M, Textures, driven
 from sfa_localization.keyframes.leveling import tilt_pairs
-from sfa_localization.keyframes.texture import quantized, texture
+from sfa_localization.keyframes.texture import channels, quantized, texture
 from sfa_localization.metric.drive_check import ROUTE, is_single_route
 from sfa_localization.metric.motion_check import MotionCheck, check_motion
 from sfa_localization.metric.motion_sources import IMAGES, POSE, late
@@ -59,7 +60,7 @@ EVEN, EVEN_SHARE = 3.0, 0.9  # a topic is periodic if this share of intervals is
 MAX_REPEATED = 0.05  # share of images that repeat the last one; more are reported
 STANDING_M = 0.02  # between images of a robot that stands
 GRID = 100  # points per axis at which coverage is evaluated
-TILT_IMAGES, TILT_PAIRS = 400, 50  # images compared for the ground's tilt, and pairs it takes
+TILT_PAIRS = 50  # that show the tilt of the ground
 DARK = 12.0  # mean gray level of 255 below which an image is dark
 
 # Pairs of images at a place with different headings show the lever arm of the camera.
@@ -147,7 +148,7 @@ class BagReport:
     `error` says why it cannot be read at all. `samples` are images from all over the drive, and
     `camera` the kind of camera that they show. `drives` are the poses (M, 3) of images with
     `odometry` in each unbroken part of it; `motion` compares odometry, images and gyroscope; `tilt`
-    is that of the ground.
+    is that of the ground; `bodies` hide the view.
     """
 
     path: str
@@ -165,6 +166,7 @@ class BagReport:
     drives: list[Array] = field(default_factory=list)
     motion: MotionCheck | None = None
     tilt: str = ''
+    bodies: list[body.Body] = field(default_factory=list)
 
     @property
     def length_m(self) -> float:
@@ -228,9 +230,10 @@ class BagReport:
         lines += [f'  {line}' for line in self.motion.as_text()] if self.motion else []
         lines += [f'  problem: {problem}' for problem in self.problems]
         lines += [f'  note: {note}' for note in self.notes]
-        if entry := self.camera and self.camera.entry(self.path):
+        camera = self.camera.entry(self.path) if self.camera else ''
+        if entries := [entry for entry in (camera, body.blind_sectors(self.bodies)) if entry]:
             lines += ['  start my_localization.yaml with:', '    /**/omnicam_node:']
-            lines += ['      ros__parameters:', f'        {entry}']
+            lines += ['      ros__parameters:', *(f'        {entry}' for entry in entries)]
         lines += [f'  not enough to train on: {lack}' for lack in self.lacks]
         return '\n'.join(lines if self.lacks else [*lines, '  enough to train on'])
 
@@ -255,6 +258,7 @@ def inspect(
         report.odometry_topic = _topic_of(bag, 'odometry', topics.odometry, report)
         _Survey(bag, report, topics, clockwise).fill()
         report.problems, report.notes = bag.problems, bag.recording.notes
+    report.notes += body.sentences(report.bodies)
     if _single_route(report.places):
         report.notes.append(ROUTE)
     if path_length(report.places) >= 1.0 and not headings_differ(report.places):
@@ -290,7 +294,7 @@ class _Survey:
         self._gyro, self._frozen, self._repeats = VisualGyro(clockwise), FrozenWatch(), 0
         self._sizes: Counter[tuple[int, ...]] = Counter()
         count = bag.topics[self._image].count if self._image else 0
-        self._every, self._tilt_every = max(count // SAMPLES, 1), -(-count // TILT_IMAGES) or 1
+        self._every, self._tilt_every = max(count // SAMPLES, 1), -(-count // body.IMAGES) or 1
         self._sphere = PanoramaConfig(clockwise=clockwise).sphere
         self._textures: dict[int, NDArray[np.int8]] = {}
         self._rolls_and_pitches: list[tuple[float, float]] = []
@@ -308,7 +312,18 @@ class _Survey:
             self._report.camera = kinds.CameraKind(*kinds.guess_geometry(alike), width, height)
         for stream in streams:
             if stream.topic == self._odometry and self._values[self._odometry]:
+                offsets = [self._by_clock_of(stream, other) for other in streams]
                 self._drive(stream)
+                if self._report.motion is not None:
+                    self._report.motion.corrected += filter(None, offsets)
+
+    def _by_clock_of(self, odometry: Stream, stream: Stream) -> str:
+        """Stamp images and yaw rates by the clock of the odometry; a sentence if theirs differs."""
+        name = {self._image: 'images', self._imu: 'gyroscope'}.get(stream.topic, '')
+        ahead_ns, text = clock_offset(name, stream, odometry) if name else (0, '')
+        values = self._values[stream.topic]
+        self._values[stream.topic] = [(stamp_ns - ahead_ns, value) for stamp_ns, value in values]
+        return text
 
     def _stream(self, name: str) -> Stream:
         if name == self._odometry:
@@ -378,16 +393,19 @@ class _Survey:
         yaw = np.array([yaw for _, (yaw, _) in images], float)
         new = [(stamp, texture) for stamp, (_, texture) in images if texture is not None]
         views = (np.array([s for s, _ in new]), np.stack([t for _, t in new])) if new else None
+        sampled = self._sampled(driven(odometry, stamps))
         if self._rolls_and_pitches:
             tilt = np.degrees(np.std(self._rolls_and_pitches, 0).mean())
             report.tilt = f'tilts the robot by {tilt:.1f} degrees'
         else:
-            report.tilt = self._camera_tilt(driven(odometry, stamps))
+            report.tilt = self._camera_tilt(sampled) if sampled is not None else ''
         turns = (stamps, yaw) if camera is not None and camera.shows_turns else None
         rates = self._values.get(self._imu, [])
         gyro = to_yaw_rate(sorted(rates)) if rates else None
         is_panorama = camera is not None and camera.is_panorama
-        report.motion = check_motion(odometry, turns, gyro, is_panorama, views)
+        commands = OpenLoop.of(odometry.twists).repeats
+        report.motion = check_motion(odometry, turns, gyro, is_panorama, views, commands)
+        report.bodies = self._bodies(sampled, stamps)
         near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
         places, broken = odometry.trajectory.at(near), report.motion.odometry
         part, of_image = (
@@ -397,17 +415,30 @@ class _Survey:
         report.odometry = replace(odometry, part=part)
         report.drives = [places[of_image == number] for number in np.unique(of_image)]
 
-    def _camera_tilt(self, path_m: Array) -> str:
-        """How the ground tilts the camera, by pairs of images after `path_m` (N,) of driving."""
+    def _bodies(self, sampled: Textures | None, stamps: Stamps) -> list[body.Body]:
+        """What hides the view, by images at stamps (N,) that turn with the robot."""
+        motion = self._report.motion
+        pair = motion and motion.pair(POSE, IMAGES)
+        if sampled is None or motion is None or (pair and pair.independent):
+            return []
+        headings = motion.odometry.trajectory.at(stamps[sampled.images])[:, 2]
+        light = channels(sampled.textures.shape[1])[0]
+        return body.bodies(sampled.textures[:, light], headings, self._sphere)
+
+    def _sampled(self, path_m: Array) -> Textures | None:
+        """Textures of images after `path_m` (N,) of driving; None without panoramas of one size."""
         if len({textures.shape for textures in self._textures.values()}) != 1:
-            return ''
+            return None
         rows = np.array([number for number in self._textures if number < len(path_m)])
         textures = np.concatenate([self._textures[number] for number in rows.tolist()])
-        images = Textures(textures, rows, np.zeros_like(rows), path_m[rows])
+        return Textures(textures, rows, np.zeros_like(rows), path_m[rows])
+
+    def _camera_tilt(self, images: Textures) -> str:
+        """How the ground tilts the camera, by pairs of images."""
         pairs = tilt_pairs(images, self._sphere)
         if len(pairs.tilt) < TILT_PAIRS:
             return ''
-        squares = np.abs(pairs.tilts(np.zeros(len(rows), complex))) ** 2
+        squares = np.abs(pairs.tilts(np.zeros(len(images.images), complex))) ** 2
         tilt = math.degrees(math.sqrt(float(squares.mean()) / 2))  # along each axis
         return f'tilts the camera by at least {tilt:.1f} degrees'
 

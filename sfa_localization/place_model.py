@@ -18,7 +18,7 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.array_files import Arrays, read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import LocalizationError, ModelError
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.rig import Rig
 from sfa_localization.data.run import Image, Origin
@@ -69,7 +69,8 @@ class PlaceModel:
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the figures
     of merit of the training, `error_correlation` that of neighboring images, `rig` the robot, and
     `ground` where it drove. Map and keyframes hold places of the camera. The map reads `turned`
-    maps, or slow features where there are none.
+    maps, or slow features where there are none. Where the robot hides its view, pixels (H, W)
+    repeat those of `repeated`.
     """
 
     network: Network
@@ -81,6 +82,7 @@ class PlaceModel:
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
     rig: Rig = field(default_factory=Rig)
+    repeated: Indices | None = None
 
     def locate(self, panorama: Image) -> Observation:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
@@ -93,8 +95,16 @@ class PlaceModel:
     @one_core()
     def locate_all(self, panoramas: Image) -> list[Observation]:
         """What panoramas (T, H, W, 3) show, each by itself."""
-        views = self.views(panoramas)
+        views = self.views(self.masked(panoramas))
         return [self.observed(view, self.located(view, Conditions())) for view in views]
+
+    def masked(self, panoramas: Image) -> Image:
+        """Panoramas (T, H, W, 3) without what hides the view; unchanged those that are masked."""
+        require_size(panoramas, self.network.architecture)
+        if self.repeated is None:
+            return panoramas
+        pixels = panoramas.reshape(len(panoramas), -1, 3)
+        return pixels[:, self.repeated.ravel()].reshape(panoramas.shape)
 
     def views(self, panoramas: Image) -> list[View]:
         """Textures of panoramas (T, H, W, 3), leveled by keyframes."""
@@ -205,6 +215,8 @@ class PlaceModel:
         arrays |= _prefixed('ground/', self.ground.to_arrays())
         if self.turned is not None:
             arrays |= _prefixed('turned/', self.turned.to_arrays())
+        if self.repeated is not None:
+            arrays['repeated'] = self.repeated
         return arrays
 
     @classmethod
@@ -221,6 +233,7 @@ class PlaceModel:
             header['quality'],
             ErrorCorrelation(**header['error_correlation']),
             Rig.from_mapping(header['rig']),
+            arrays.get('repeated'),
         )
 
 

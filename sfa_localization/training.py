@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from sfa_localization.bags.drives import image_folder, read_drives
+from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
@@ -147,5 +148,6 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         quality,
         keyframe_map.correlation,
         rig,
+        repeated=Unwrapper(given.recipe.camera, given.panorama).repeated,
     )
     return Trained(model, given.runs, images.slow, segments, result)

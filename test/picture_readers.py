@@ -53,6 +53,7 @@ class PictureReader:
 
     panorama: PanoramaConfig = SIZE
     heading: bool = True
+    origin: tuple[float, float] | None = None
     error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
     rig: Rig = dataclasses.field(default_factory=Rig)
     ground: DrivenGround = dataclasses.field(default_factory=lambda: DROVE)

@@ -170,6 +170,13 @@ def full(path, *more):
     return record(path, [*entries, *poses_of(odometry, '/odom'), *more])
 
 
+def test_a_folder_that_holds_bags_is_none(tmp_path):
+    for name in 'ba':
+        full(tmp_path / name)
+    with pytest.raises(BagError, match='is no bag; it holds the bags a, b: name them'):
+        Bag(tmp_path).__enter__()
+
+
 def test_a_missing_or_wrong_topic_names_the_remedy(tmp_path, messages):
     """And of several that could be meant, which there are."""
     with Bag(full(tmp_path / 'bag', ('/second', stamp(1), picture(stamp(1))))) as bag:

@@ -26,6 +26,7 @@ from sfa_localization.inspection import (
     headings_differ,
     hull_area,
     inspect,
+    lacks_of_drives,
     path_length,
 )
 from sfa_localization.metric.drive_check import ROUTE
@@ -114,6 +115,42 @@ def test_it_gives_the_reason_why_a_drive_is_not_enough(options, reason, tmp_path
     report = inspect(write(tmp_path / 'bag', **options), config=ENOUGH)
     assert any(reason in lack for lack in report.lacks), report.lacks
     assert f'not enough to train on: {report.lacks[0]}' in report.as_text()
+
+
+def lanes(apart, side):
+    """Poses along lanes over a square, and straight back over all of them."""
+    across = np.repeat(np.arange(0, side + 1e-9, apart), 2)
+    order = np.arange(len(across))
+    ends = np.append(across + 1j * side * (order // 2 % 2 != order % 2), [0.3j, side + 0.9j * side])
+    along = np.interp(np.linspace(0, len(ends) - 1, 600), np.arange(len(ends)), ends)
+    return np.column_stack([along.real, along.imag, np.zeros(600)])
+
+
+@pytest.mark.parametrize(('lane', 'lacks'), [((6, 12), []), ((30, 30), ['of the area lie within'])])
+def test_drives_in_frames_of_their_own_lack_what_no_arrangement_of_them_gives(lane, lacks):
+    config, drive = InspectionConfig(min_pictures=1000), lanes(*lane)
+    few, sparse, *_ = lacks_of_drives([drive], config)
+    assert few.startswith('600 images') and 'of the area lie within' in sparse
+    together = list(lacks_of_drives([drive, drive + 1.0], config))
+    assert len(together) == len(lacks)
+    assert all(map(str.__contains__, together, lacks))
+
+
+def test_several_bags_are_judged_together(tmp_path, capsys):
+    bags = [str(write(tmp_path / name, pictures=200 + k)) for k, name in enumerate('ab')]
+    dark = [str(write(tmp_path / n, pictures=300 + k, brightness=4)) for k, n in enumerate('cd')]
+    told = tmp_path / 'told.json'
+    for words, code, verdict in (
+        (bags, 0, 'together: enough to train on'),
+        ([*bags, '--min-pictures', '402'], 1, 'together not enough: 401 images with odometry are'),
+        ([*dark, '--json', str(told)], 1, f'together not enough: {dark[0]}, {dark[1]}: the images'),
+        ([bags[0], bags[0]], 1, f'{bags[0]} and {bags[0]} are the same drive'),
+    ):
+        spacing = ['--max-spacing', '2.0']
+        assert main(['inspect', *words, *spacing]) == code
+        assert verdict in capsys.readouterr().out
+    together = json.loads(told.read_text())['together']
+    assert together['enough_to_train_on'] is False and len(together['lacks']) == 1
 
 
 @pytest.mark.parametrize('route', [lambda share: (30 * share, 0.0), circle])

@@ -188,6 +188,11 @@ def test_clocks_that_differ_are_corrected_or_reported(sample, tmp_path, late_s, 
     assert any('synchronize' in lack for lack in report.lacks) == (abs(late_s) > 0.5)
 
 
+def shifted(stamps_ns, rate):
+    """Stamps of a clock that gains `rate` s in each second."""
+    return stamps_ns + np.round((stamps_ns - stamps_ns[0]) * rate).astype(np.int64)
+
+
 # The comparison itself, of drives whose motion is known.
 
 DRIVES = {
@@ -205,6 +210,63 @@ def test_a_map_is_compared_with_its_odometry_over_ten_meters():
     collapsed = compare_map(run.odometry, run.stamps_ns, poses * [0.4, 0.4, 1.0])
     assert collapsed.differs('scale') and collapsed.scale == pytest.approx(0.4, abs=0.04)
     assert compare_map(run.odometry, run.stamps_ns, poses[::-1]).differs('alike')
+
+
+@pytest.mark.parametrize('rate', [0.005, -0.003, 0.0])
+@pytest.mark.parametrize(('late', 'said'), [
+    ('images', 'images: their'), ('gyroscope', 'gyroscope: its'), ('both', 'odometry: its')
+])  # fmt: skip
+def test_a_clock_that_drifts_is_followed_along_the_drive(late, said, rate):
+    run = drive(*DRIVES['straight legs'][:1], yaw_noise=0.02, seed=1)
+    images, gyro = run.stamps_ns, run.gyro
+    if late != 'gyroscope':
+        images = shifted(images, rate)
+    if late != 'images':
+        gyro = replace(gyro, stamps_ns=shifted(gyro.stamps_ns, rate))
+    panoramas = PanoramaArray(images, np.zeros((len(images), 1, 1, 3), np.uint8))
+    recorded = Run('run', panoramas, run.odometry, gyro)
+    (corrected,), (check,) = check_drives([recorded], [run.poses[:, 2]])
+    fast = (rate > 0) == (late != 'both')
+    text = f'{said} clock runs {abs(rate):.2%} {"fast" if fast else "slow"}: taken into account'
+    assert check.wrong == [] and check.corrected == [text.replace('%', ' %')] * (rate != 0)
+    if rate:
+        assert np.abs(corrected.panoramas.stamps_ns - run.stamps_ns).max() < 2e7
+
+
+FOLLOWING = {
+    'with a lag of 0.5 s': (0.5, np.inf, 0.0),
+    'with a lag of 2 s': (2.0, np.inf, 0.0),
+    'at 0.2 rad/s at most': (0.0, 0.2, 0.0),
+    'beyond 23 degrees only': (0.0, np.inf, 0.4),
+}
+
+
+@pytest.mark.parametrize('how', FOLLOWING)
+def test_images_that_follow_the_turns_are_refused_and_no_delay_is(how):
+    run = drive(*DRIVES['straight legs'][:1], yaw_noise=0.02, seed=1)
+    lag_s, fastest, ignored = FOLLOWING[how]
+    yaw, shown = np.unwrap(run.odometry.poses[:, 2]), [0.0]
+    for now in yaw[1:]:
+        behind = now - shown[-1]
+        pulled = (behind - np.clip(behind, -ignored, ignored)) * (0.02 / lag_s if lag_s else 1)
+        shown.append(shown[-1] + np.clip(pulled, -0.02 * fastest, 0.02 * fastest))
+    seen = np.interp(run.stamps_ns, run.odometry.stamps_ns, shown)
+    for gyro in (run.gyro, None):
+        check = check_motion(run.odometry, (run.stamps_ns, seen), gyro)
+        assert len(check.wrong) == 1 and f"follow the robot's turns {how}: switch" in check.wrong[0]
+    # Odometry that repeats commands is followed by the robot, and a gyroscope shows it.
+    for gyro in (None, replace(run.gyro, omega=np.gradient(shown, 0.02))):
+        check = check_motion(run.odometry, (run.stamps_ns, seen), gyro, commands=True)
+        assert not any('follow' in text for text in check.wrong)
+
+
+@pytest.mark.parametrize(('late_s', 'every'), [(0.45, 1), (-0.3, 1), (0.15, 3)])
+def test_a_delay_or_few_images_are_no_stabilization(late_s, every):
+    run = drive(*DRIVES['straight legs'][:1], yaw_noise=0.02, seed=2)
+    jitter = np.random.default_rng(0).normal(0.0, 0.02, len(run.stamps_ns))
+    stamps_ns = run.stamps_ns + np.round((late_s + jitter) * 1e9).astype(np.int64)
+    check = check_motion(run.odometry, (stamps_ns[::every], run.poses[::every, 2]), run.gyro)
+    assert check.wrong == [] and not any('clock' in text for text in check.corrected)
 
 
 def test_a_drive_that_hardly_turns_says_nothing():

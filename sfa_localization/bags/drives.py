@@ -21,7 +21,7 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.satellite_fixes import in_plane
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.static_transforms import lever_arm
-from sfa_localization.bags.topic_stream import Stream
+from sfa_localization.bags.topic_stream import Stream, clock_offset
 from sfa_localization.camera.leveling import LeveledPanoramas, tilts_at
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
@@ -45,6 +45,9 @@ ODOMETRY_TOLERANCE_S = 0.5
 """An image is used when odometry before and after it is this near (s); poses are not interpolated
 over a longer pause."""
 _SAME_IMAGE_NS = 1_000_000  # stamps of one image differ by less
+# Uses of topics whose messages are sent when measured, in words.
+_STAMPED_AT_ONCE = {'images': 'images', 'imu': 'gyroscope', 'orientation': 'orientation',
+                    'ground_truth': 'ground truth'}  # fmt: skip
 logger = logging.getLogger(__name__)
 R = TypeVar('R', bound='ReadingRecipe')
 
@@ -150,14 +153,14 @@ def read_drive(
     with Bag(path, strict=strict, config=recipe.bag) as bag:
         name = bag.find('image', recipe.topics.image)
         try:
-            stored = _PanoramaFile(Path(cache), recipe)
+            stored = _PanoramaFile(Path(cache), recipe, _is_ready(bag, name))
             streams = {'images': bag.stream(name, stored.panorama)}
             streams |= _other_streams(bag, recipe, want_truth)
             values = _read(bag, streams, stored, progress)
             odometry = bag.to_odometry(streams['odometry'], values['odometry'])
-            stamps_ns, near_s = np.array(stored.stamps, np.int64), recipe.odometry_tolerance_s
-            covered = odometry.trajectory.covers(stamps_ns, int(near_s * 1e9))
-            _require_covered(streams['images'], covered, near_s)
+            stamps_ns = np.array(stored.stamps, np.int64) - _by_one_clock(bag, streams, values)
+            covered = odometry.trajectory.covers(stamps_ns, int(recipe.odometry_tolerance_s * 1e9))
+            _require_covered(streams['images'], covered, recipe.odometry_tolerance_s)
             panoramas: Panoramas = stored.finish(stamps_ns, covered)
             if recipe.camera.level_by_imu:
                 imu, tilts = streams['orientation'], values['orientation']
@@ -191,27 +194,40 @@ def _measured(
     return origin, to_points(values['points'], lever or 0j)
 
 
+def _is_ready(bag: Bag, topic: str) -> bool:
+    """Whether images are those of omnicam_node, which also publishes their geometry: it has mounted
+    and masked the camera.
+    """
+    return f'{topic.removesuffix("/compressed")}/info' in bag.topics
+
+
 class _PanoramaFile:
     """Makes panoramas of one size, and stores them in a temporary file."""
 
-    def __init__(self, folder: Path, recipe: ReadingRecipe) -> None:
+    def __init__(self, folder: Path, recipe: ReadingRecipe, is_ready: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as the run
         self._unwrap = Unwrapper(recipe.camera, recipe.panorama)
+        self._unwrap.check()
+        if is_ready:
+            masked = CameraConfig(blind_sectors=recipe.camera.blind_sectors)
+            self._unwrap = Unwrapper(masked, recipe.panorama)
         self._watch = FrozenWatch() if recipe.distinct else None
         self.stamps: list[int] = []
         self._shape: tuple[int, ...] = ()
 
     def panorama(self, image: Image) -> Image:
         """The panorama of a camera's image. Raises LocalizationError."""
-        if not looks_like_panorama(*image.shape[:2]):
-            image = self._unwrap(image)
+        if looks_like_panorama(*image.shape[:2]):
+            if not self._shape:
+                self._unwrap = self._unwrap.keeping_size((image.shape[0], image.shape[1]))
+            elif image.shape != self._shape:
+                height, width = self._shape[:2]
+                raise MessageError(f'size is not {width}x{height} like the first image')
+        image = self._unwrap(image)
         if self._watch is not None and not self._watch.add(image):
             raise MessageError('image repeats the one before')
         self._shape = self._shape or image.shape
-        if image.shape != self._shape:
-            height, width = self._shape[:2]
-            raise MessageError(f'size is not {width}x{height} like the first image')
         return image
 
     def add(self, stamp_ns: int, image: Image) -> None:
@@ -267,6 +283,21 @@ def _read(
             else:
                 values[uses[id(stream)]].append((stamp_ns, value))
     return values
+
+
+def _by_one_clock(bag: Bag, streams: dict[str, Stream], values: dict[str, StampedValues]) -> int:
+    """Stamp the values by the clock of the odometry, where their reception shows another one; log
+    it, and return by how much, ns, the stamps of the images are ahead of it.
+    """
+    images_ns = 0
+    for use, stream in streams.items():
+        if use in _STAMPED_AT_ONCE:
+            ahead_ns, text = clock_offset(_STAMPED_AT_ONCE[use], stream, streams['odometry'])
+            values[use] = [(stamp_ns - ahead_ns, value) for stamp_ns, value in values[use]]
+            images_ns = ahead_ns if use == 'images' else images_ns
+            if text:
+                logger.warning('%s: %s', bag.path, text)
+    return images_ns
 
 
 def _leveled(panoramas: Panoramas, imu: Stream, tilts: StampedValues, sphere: Sphere) -> Panoramas:

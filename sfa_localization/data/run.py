@@ -203,6 +203,27 @@ class PanoramaArray:
 
 
 @dataclass(frozen=True, slots=True)
+class StampedPanoramas:
+    """Panoramas with other stamps (N,)."""
+
+    stamps_ns: Stamps
+    panoramas: Panoramas
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.panoramas.shape
+
+    def __len__(self) -> int:
+        return len(self.panoramas)
+
+    def read(self, start: int, stop: int) -> Image:
+        return self.panoramas.read(start, stop)
+
+    def batches(self, size: int) -> Iterator[Image]:
+        return self.panoramas.batches(size)
+
+
+@dataclass(frozen=True, slots=True)
 class Run:
     """One drive: images, odometry, measured points and, for evaluation only, the ground truth.
 

@@ -76,7 +76,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
     # Life cycle.
 
     def setup(self) -> None:
-        self._build_tables(self._unwrapper)
+        self._unwrapper.check(self._size)
         self._frozen = FrozenWatch()
         self._panoramas = self.publisher(ImageMessage, 'panorama', 2)
         compressed = self.following('panorama/compressed')
@@ -147,7 +147,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         lens = calibration_of_info(message)
         if self._lens is None:
             unwrapper = self._new_unwrapper(self._settings, lens)
-            self._build_tables(unwrapper)
+            unwrapper.check(self._size)
             self._lens, self._unwrapper = lens, unwrapper
             camera = f'{lens.camera_model} camera of {lens.image_width} x {lens.image_height}'
             self.get_logger().info(f'{self.full_name(_CAMERA_INFO)} describes a {camera} pixels')
@@ -223,7 +223,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def check(self, settings: Current) -> None:
         """Raises LocalizationError for a mask, sector, mount or elevation that hides all."""
         if any(settings[kind] != self._settings[kind] for kind in (CameraConfig, PanoramaConfig)):
-            self._build_tables(self._new_unwrapper(settings, self._lens))
+            self._new_unwrapper(settings, self._lens).check(self._size)
 
     def settings_changed(self, settings: Settings) -> None:
         if isinstance(settings, CaptureConfig) and self._feed is not None:
@@ -237,13 +237,6 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def _new_unwrapper(settings: Current, lens: LensCalibration | None = None) -> Unwrapper:
         camera, panorama = settings[CameraConfig], settings[PanoramaConfig]
         return Unwrapper(cast(CameraConfig, camera), cast(PanoramaConfig, panorama), lens)
-
-    def _build_tables(self, unwrapper: Unwrapper) -> None:
-        """Build the tables for the images' size, if an image or the calibration gives it."""
-        lens = unwrapper.calibration if unwrapper.model else None
-        size = self._size or (lens and (lens.image_height, lens.image_width)) or (0, 0)
-        if lens and 0 not in size:
-            unwrapper.visible(size)
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         details = {'camera model': self._unwrapper.model}
@@ -278,9 +271,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
             return _WARN, f'the camera has repeated its last image for {frozen_s:.0f} s'
         if monitor.received and not monitor.used:
             return _ERROR, 'no image could be used so far'
-        visible = 1.0
-        if self._size is not None and not self._unwrapper.is_panorama(self._size):
-            visible = float(self._unwrapper.visible(self._size).mean())
+        visible = 1.0 if self._size is None else self._unwrapper.visible(self._size).mean()
         details['panorama visible [%]'] = f'{100 * visible:.0f}'
         if visible < _LITTLE_VISIBLE:
             return _WARN, f'the camera sees only {100 * visible:.0f} % of the panorama'

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 
+import cv2
 import numpy as np
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores
@@ -129,6 +130,42 @@ def lost(m, rng, share=0.05):
         m.pose.orientation = type(m.pose.orientation)(0.0, 0.0, 0.0, 1.0)
 
 
+def ahead(topic, seconds):
+    """Changes that stamp a topic so many s ahead."""
+    return {topic: lambda m, _: restamp(m, stamp_of(m) + round(seconds * SECOND_NS))}
+
+
+def fast(topic, rate):
+    """Changes by a clock that gains `rate` s in each second since the first message."""
+    first = []
+
+    def change(m, _):
+        first.append(stamp_of(m))
+        restamp(m, first[0] + round((first[-1] - first[0]) * (1 + rate)))
+
+    return {topic: change}
+
+
+def following(lag_s):
+    """Changes by a camera that turns its images after the robot, with a lag."""
+    state = {}
+
+    def turned(m, _):
+        q, now = m.pose.pose.orientation, stamp_of(m)
+        yaw = 2 * np.arctan2(q.z, q.w)
+        before, shown = state.get('yaw', (now, yaw))
+        behind = (yaw - shown + np.pi) % (2 * np.pi) - np.pi
+        shown += behind * -np.expm1((before - now) / (lag_s * SECOND_NS))
+        state.update(yaw=(now, shown), behind=yaw - shown)
+
+    def roll(m, _):
+        image = cv2.imdecode(np.asarray(m.data), cv2.IMREAD_COLOR)
+        columns = round(-state.get('behind', 0.0) * image.shape[1] / (2 * np.pi))
+        m.data = cv2.imencode('.jpg', np.roll(image, columns, 1))[1].ravel()
+
+    return {ODOMETRY: turned, IMAGES: roll}
+
+
 def fixed(m, rng):
     """A receiver of satellites, 50 degrees north, with corrections of a base station."""
     east, north = np.array([m.pose.position.x, m.pose.position.y]) + rng.normal(0, 0.02, 2)
@@ -207,6 +244,24 @@ TROUBLES = {
     'truth: 0.3 s late': Trouble(
         lambda: {TRUTH: lambda m, _: restamp(m, stamp_of(m) + 300_000_000)},
         RIGHT_M, 'ground truth.* 0.30 s late', trains=False,
+    ),
+    'images: TAI': Trouble(
+        lambda: ahead(IMAGES, 37), RIGHT_M, r'images: stamped 37\.0 s ahead .* in TAI'
+    ),
+    'odometry: GPS time': Trouble(
+        lambda: ahead(ODOMETRY, 18), RIGHT_M, r'images: stamped 18\.0 s behind .*/odom in GPS time'
+    ),
+    'images: an hour behind': Trouble(
+        lambda: ahead(IMAGES, -3600.4), RIGHT_M, r'images: stamped 3600\.4 s behind'
+    ),
+    'images: 0.3 % fast': Trouble(
+        lambda: fast(IMAGES, 0.003), RIGHT_M, r'images: their clock runs 0\.30 % fast'
+    ),
+    'odometry: 0.5 % slow': Trouble(
+        lambda: fast(ODOMETRY, -0.005), (0.1, 0.1), r'odometry: its clock runs 0\.50 % slow'
+    ),
+    'images follow the turns': Trouble(
+        lambda: following(0.5), None, "images follow the robot's turns with a lag of 0.5 s"
     ),
     'points: fixes of a receiver': Trouble(
         lambda: {TRUTH: fixed}, (0.06, 0.07), 'latitude .*, longitude .* is the origin',
