@@ -35,7 +35,7 @@ from sfa_localization.fusion.belief import (
     Update,
     newest_new,
 )
-from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
+from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder, ImageClock
 from sfa_localization.fusion.ekf import Ekf
 from sfa_localization.fusion.health import Health, health_of
 from sfa_localization.fusion.history import History
@@ -75,6 +75,7 @@ class PoseFilter:
         self.scale = self.config.odometry_scale
         self._nis = 0.0, 0
         self._camera, self._expected_s = CameraClockFinder(_CLOCK_MEMORY), 0.0
+        self._images = ImageClock(_CLOCK_MEMORY)
         self._rig = Rig()
         self._ekf = Ekf(self.config, self.correlation, self._rig)
         self._history = self._fresh(self._ekf.blank(0))
@@ -172,7 +173,8 @@ class PoseFilter:
         self._open_loop.add(twist.v, twist.omega)
         driven = self._history.add((stamp_ns, ODOMETRY), OdometryEvent(stamp_ns, twist, scaled))
         if driven.odometry.stamp_ns == stamp_ns:
-            self._camera.add_odometry(stamp_ns, driven.dead_reckoned[2])
+            for clock in self._camera, self._images:
+                clock.add_odometry(stamp_ns, driven.dead_reckoned[2])
         return ''
 
     def _path_pose(
@@ -200,11 +202,12 @@ class PoseFilter:
 
         A heading that is NaN or less certain than inputs.YAW_STD_LIMIT is left out. Zero covariance
         means unknown. The filter does not start from a pose so uncertain that it would be LOST.
+        The stamp of the update is by the clock of the odometry.
         """
-        stamp_ns = int(stamp_ns)
+        again = partial(self.add_measurement, stamp_ns, value, covariance)
+        stamp_ns = int(stamp_ns) - self._images.offset_ns
         try:
             fused, noise = read_measurement(value, covariance, self.config.measurement_factor)
-            again = partial(self.add_measurement, stamp_ns, value, covariance)
             self._timeline.require_order(stamp_ns, MEASUREMENT, self._history, again)
             clock = self._camera.clock_at(stamp_ns)
             taken_ns = stamp_ns - clock.delay_ns  # by the clock of the odometry
@@ -230,8 +233,15 @@ class PoseFilter:
         The turns of images and odometry together show by how much the camera's stamps are late;
         images are then fused where they were taken.
         """
-        if stamp_ns > 0 and math.isfinite(yaw_rad):
-            self._camera.add_heading(int(stamp_ns), yaw_rad)
+        if stamp_ns <= 0 or not math.isfinite(yaw_rad):
+            return
+        odometry_ns = self._history.newest.odometry.stamp_ns
+        if odometry_ns is not None:
+            finder = self._images.add_heading(int(stamp_ns), yaw_rad, odometry_ns)
+            if finder is not None:
+                self._camera, self._expected_s = finder, 0.0
+                self.counts[f'images: {self._images}'] += 1
+        self._camera.add_heading(int(stamp_ns) - self._images.offset_ns, yaw_rad)
 
     def expect(self, rig: Rig) -> None:
         """Take the rig of the training as prior. Estimates since the start stay; the camera delay

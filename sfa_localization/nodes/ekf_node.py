@@ -183,7 +183,7 @@ class EkfNode(LocalizationNode):
             covariance[2, 2] = math.inf  # a source without heading leaves its variance 0
         update = self.filter.add_measurement(stamp_ns, pose, covariance)
         self._publish_verdict(update)
-        self._publish_pose(stamp_ns)
+        self._publish_pose(update.stamp_ns)
         if not update.accepted:
             raise MessageError(update.reason)
 
