@@ -315,16 +315,17 @@ class _Survey:
             if stream.topic == self._odometry and self._values[self._odometry]:
                 offsets = [self._by_clock_of(stream, other) for other in streams]
                 self._drive(stream)
-                if self._report.motion is not None:
-                    self._report.motion.corrected += filter(None, offsets)
+                if motion := self._report.motion:
+                    motion.corrected += [text for ahead_ns, text in offsets if ahead_ns]
+                    motion.notes += [text for ahead_ns, text in offsets if text and not ahead_ns]
 
-    def _by_clock_of(self, odometry: Stream, stream: Stream) -> str:
-        """Stamp images and yaw rates by the clock of the odometry; a sentence if theirs differs."""
+    def _by_clock_of(self, odometry: Stream, stream: Stream) -> tuple[int, str]:
+        """Stamp images and yaw rates by the clock of the odometry: see `clock_offset`."""
         name = {self._image: 'images', self._imu: 'gyroscope'}.get(stream.topic, '')
         ahead_ns, text = clock_offset(name, stream, odometry) if name else (0, '')
         values = self._values[stream.topic]
         self._values[stream.topic] = [(stamp_ns - ahead_ns, value) for stamp_ns, value in values]
-        return text
+        return ahead_ns, text
 
     def _stream(self, name: str) -> Stream:
         if name == self._odometry:

@@ -42,9 +42,8 @@ from sfa_localization.bags.topic_stream import Item, Stream, clock_offset
             19,
             'images: stamped 19.0 s behind the odometry, by their reception (/odom',
         ),
-        # What turns show, and what a queue may have delayed, are left as they are.
-        (IMAGES, 1, ''),
-        (IMAGES, -7, ''),
+        (IMAGES, 1, ''),  # turns show it
+        (IMAGES, -7, 'delayed, or by another clock? not corrected'),
     ],
 )
 def test_clocks_that_differ_by_their_reception_become_one(topic, ahead_s, text, tmp_path, caplog):
@@ -55,7 +54,7 @@ def test_clocks_that_differ_by_their_reception_become_one(topic, ahead_s, text, 
     for name in ('panoramas', 'yaw_rate', 'ground_truth'):
         late_ns = getattr(read, name).stamps_ns[20] - getattr(right, name).stamps_ns[20]
         late_ns -= read.odometry.stamps_ns[20] - right.odometry.stamps_ns[20]
-        if text:
+        if 'not' not in text and text:
             assert abs(late_ns) < SECOND_NS // 20
 
 

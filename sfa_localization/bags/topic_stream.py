@@ -141,20 +141,19 @@ class Stream:
 
 def clock_offset(name: str, stream: Stream, odometry: Stream) -> tuple[int, str]:
     """By how much, ns, a stream's stamps are ahead of those of the odometry by the reception of
-    both, and a sentence; 0 and '' for less than turns show, for what queues may have delayed, and
-    for bags that do not hold the times of reception.
+    both, and a sentence; 0 and '' for less than turns show, and for bags that do not hold the times
+    of reception; 0 also for what queues may have delayed.
     """
     (ahead, spread), (other, other_spread) = stream.ahead_ns, odometry.ahead_ns
-    offset, range_ns = ahead - other, CLOCK_RANGE_S * 1e9
-    queued = min(ahead, other) > -CLOCK_JUMP_NS and max(ahead, other) < range_ns
+    offset_ns, range_ns = whole_leap(ahead - other), CLOCK_RANGE_S * 1e9
     # If a bag holds no times of reception, stamps are ahead by the length of the drive.
-    if abs(offset) <= max(range_ns, spread, other_spread) or queued:
+    if abs(offset_ns) <= max(range_ns, spread, other_spread):
         return 0, ''
-    offset_ns = whole_leap(offset)
-    seconds = abs(offset_ns) * 1e-9
+    seconds, where = abs(offset_ns) * 1e-9, 'ahead of' if offset_ns > 0 else 'behind'
     scale = LEAP_SECONDS.get(round(seconds), '')
     if scale:
-        scale = f' ({stream.topic if offset > 0 else odometry.topic} in {scale}?)'
-    where = 'ahead of' if offset > 0 else 'behind'
+        scale = f' ({stream.topic if offset_ns > 0 else odometry.topic} in {scale}?)'
     text = f'{name}: stamped {seconds:.1f} s {where} the odometry, by their reception{scale}'
+    if min(ahead, other) > -CLOCK_JUMP_NS and max(ahead, other) < range_ns:
+        return 0, f'{text}: delayed, or by another clock? not corrected'
     return offset_ns, f'{text}: taken into account'

@@ -384,7 +384,8 @@ TROUBLES = {
         lambda: ahead(IMAGES, -3600.4), RIGHT_M, r'images: stamped 3600\.4 s behind'
     ),
     'images: 0.3 % fast': Trouble(
-        lambda: fast(IMAGES, 0.003), RIGHT_M, r'images: their clock runs 0\.30 % fast'
+        # In a test drive of 32 s it gains 0.1 s, too little to be certain of.
+        lambda: fast(IMAGES, 0.003), (0.07, 0.05), r'images: their clock runs 0\.30 % fast'
     ),
     'odometry: 0.5 % slow': Trouble(
         lambda: fast(ODOMETRY, -0.005), (0.1, 0.1), r'odometry: its clock runs 0\.50 % slow'
