@@ -6,7 +6,9 @@ or a driver would, and states the error and the sentence that are right.
 `PYTHONPATH=.:test python -m robustness --troubles` runs them all: train, then evaluate.
 """
 
+import itertools
 import json
+import math
 import re
 import subprocess
 import sys
@@ -137,6 +139,55 @@ def lost(m, rng, share=0.05):
     if rng.random() < share:
         m.pose.position.x = m.pose.position.y = 0.0
         m.pose.orientation = type(m.pose.orientation)(0.0, 0.0, 0.0, 1.0)
+
+
+def wrong_rate(share, value):
+    """A gyroscope of which a share of the messages reports another rate, rad/s."""
+
+    def change(m, rng):
+        if rng.random() < share:
+            m.angular_velocity.z = value * rng.choice([-1.0, 1.0])
+
+    return change
+
+
+def held_rate(period_s=4.0, share=0.25):
+    """A gyroscope that repeats a rate for a share of each period."""
+    last = [0.0]
+
+    def change(m, _):
+        if stamp_of(m) * 1e-9 % period_s < share * period_s:
+            m.angular_velocity.z = last[0]
+        last[0] = m.angular_velocity.z
+
+    return change
+
+
+def second_publisher():
+    """Every second message comes from another publisher, whose origin is elsewhere."""
+    count = itertools.count()
+
+    def change(m, _):
+        if next(count) % 2:
+            place, q = m.pose.pose.position, m.pose.pose.orientation
+            place.x, place.y = 2.0 - place.y, 1.0 + place.x  # turned by 90 degrees
+            q.z, q.w = (q.z + q.w) / math.sqrt(2.0), (q.w - q.z) / math.sqrt(2.0)
+
+    return change
+
+
+def fill(m, x, quaternion, twist=True):
+    """Fill the pose of a message with this x and quaternion, and perhaps its twist with zeros."""
+    m.pose.pose.position.x, m.pose.pose.position.y = x, 0.0
+    m.pose.pose.orientation = type(m.pose.pose.orientation)(*quaternion)
+    if not twist:
+        m.twist.twist.linear.x = m.twist.twist.angular.z = 0.0
+
+
+def zeros_at_times(m, rng):
+    """A driver that sends a message of zeros now and then."""
+    if rng.random() < 0.02:
+        fill(m, 0.0, (0, 0, 0, 1), twist=False)
 
 
 def ahead(topic, seconds):
@@ -295,6 +346,33 @@ TROUBLES = {
     'truth: 0.3 s late': Trouble(
         lambda: {TRUTH: lambda m, _: restamp(m, stamp_of(m) + 300_000_000)},
         RIGHT_M, 'ground truth.* 0.30 s late', trains=False,
+    ),
+    'gyroscope: 20 % zeros': Trouble(
+        lambda: {IMU: wrong_rate(0.2, 0.0)}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
+    ),
+    'gyroscope: 1 % spikes': Trouble(
+        lambda: {IMU: wrong_rate(0.01, 30.0)}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
+    ),
+    'gyroscope: held': Trouble(
+        lambda: {IMU: held_rate()}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
+    ),
+    'gyroscope: half of it zeros': Trouble(
+        lambda: {IMU: wrong_rate(0.5, 0.0)}, RIGHT_M, 'gyroscope: left out: the wheels agree better'
+    ),
+    'odometry: two publishers': Trouble(
+        lambda: {ODOMETRY: second_publisher()}, None, 'two publishers on /odom: .*; stop one'
+    ),
+    'odometry: single zeros': Trouble(
+        lambda: {ODOMETRY: zeros_at_times},
+        RIGHT_M, 'messages left out: pose beside the path',
+    ),
+    'odometry: quaternion of zeros': Trouble(
+        lambda: {ODOMETRY: lambda m, _: fill(m, 0.0, (0, 0, 0, 0))},
+        RIGHT_M, 'have no pose .*; the twist is integrated',
+    ),
+    'odometry: NaN poses': Trouble(
+        lambda: {ODOMETRY: lambda m, _: fill(m, math.nan, (0, 0, 0, 1))},
+        RIGHT_M, 'have no pose .*; the twist is integrated',
     ),
     'images: TAI': Trouble(
         lambda: ahead(IMAGES, 37), RIGHT_M, r'images: stamped 37\.0 s ahead .* in TAI'
