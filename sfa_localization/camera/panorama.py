@@ -46,6 +46,7 @@ class _Tables:
     fractions: NDArray[np.uint16]
     border: int
     visible: Mask
+    repeated: Indices | None
 
 
 class Unwrapper:
@@ -122,9 +123,7 @@ class Unwrapper:
     def repeated(self) -> Indices | None:
         """The pixel of a panorama, row by row, that each (H, W) repeats; None: all are visible."""
         size = self.panorama.height, self.panorama.width
-        visible = build_tables(*self._of_panoramas(), self.panorama, size).visible
-        rows, columns = nearest_visible(visible)
-        return None if visible.all() else rows * size[1] + columns
+        return build_tables(*self._of_panoramas(), self.panorama, size).repeated
 
     @property
     def mount_rpy(self) -> tuple[float, ...]:
@@ -178,19 +177,25 @@ def build_tables(
     model = make_camera(calibration, size, panorama, camera.mount_rpy)
     rays = panorama_rays(panorama)
     pixels = model.project(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
-    visible = np.isfinite(pixels[..., 0]) & ~_in_sectors(rays, camera.blind_sectors)
+    visible = np.isfinite(pixels[..., 0])
+    wraps = calibration.camera_model in UNCALIBRATED  # its columns close on themselves
+    if wraps:  # beyond its upper and lower edge, as leveling does, these are repeated
+        pixels = model.lens.project(rays @ model.rotation)
+    hidden = _in_sectors(rays, camera.blind_sectors)
     if camera.mask_file:
         mask = read_mask(camera.mask_file, size)
         nearest = np.rint(np.nan_to_num(pixels)).astype(int).clip(0, [size[1] - 1, size[0] - 1])
-        visible &= mask[nearest[..., 1], nearest[..., 0]]
-    columns, rows = np.moveaxis(pixels[nearest_visible(visible)], -1, 0)
-    wraps = calibration.camera_model in UNCALIBRATED  # its columns close on themselves
+        hidden |= ~mask[nearest[..., 1], nearest[..., 0]]
+    visible &= ~hidden
+    from_rows, from_columns = nearest_visible(~hidden if wraps and visible.any() else visible)
+    columns, rows = np.moveaxis(pixels[from_rows, from_columns], -1, 0)
     if not wraps:
         columns = np.clip(columns, 0, size[1] - 1)
     rows = np.clip(rows, 0, size[0] - 1)
     maps = cv2.convertMaps(columns.astype(np.float32), rows.astype(np.float32), cv2.CV_16SC2)
     border = cv2.BORDER_WRAP if wraps else cv2.BORDER_REPLICATE
-    return _Tables(np.asarray(maps[0]), np.asarray(maps[1]), border, visible)
+    repeated = from_rows * panorama.width + from_columns if hidden.any() else None
+    return _Tables(np.asarray(maps[0]), np.asarray(maps[1]), border, visible, repeated)
 
 
 def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
