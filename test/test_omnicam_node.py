@@ -31,7 +31,7 @@ from geometry_msgs.msg import Quaternion
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from ros_bench import until
-from sensor_msgs.msg import CompressedImage, Image, Imu
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_msgs.msg import String
 
 from sfa_localization.camera.video import ImageReader
@@ -187,6 +187,38 @@ def test_nobody_listens_nothing_is_done(bench):
         assert until(lambda: node.count_subscribers('image_raw') == 1)
         bench.do(bench.node.destroy_subscription, listener)
         assert until(lambda: node.count_subscribers('image_raw') == 0)
+
+
+FISHEYE = LensCalibration(
+    camera_model='fisheye', fx=200.0, fy=200.0, distortion=(0.1, 0.0, 0.0, 0.0), radius_min=0.0,
+    radius_max=0.0,
+)  # fmt: skip
+
+
+def camera_info(model='equidistant', focal=200.0, coefficients=FISHEYE.distortion):
+    k = [focal, 0.0, 319.5, 0.0, focal, 319.5, 0.0, 0.0, 1.0]
+    return CameraInfo(width=640, height=640, distortion_model=model, k=k, d=coefficients)
+
+
+@pytest.mark.parametrize(('rule', 'images', 'infos'), [
+    ('__node:=omnicam_node', 'image_raw', 'camera_info'),
+    ('image_raw:=/front/image', '/front/image', '/front/camera_info'),
+    ('camera_info:=/calibration', 'image_raw', '/calibration'),
+])  # fmt: skip
+def test_camera_info_beside_the_images_describes_the_camera(bench, rule, images, infos):
+    """The first that can be used; one that cannot is refused with the remedy."""
+    given = {'cli_args': ['--ros-args', '-r', rule]}
+    node = bench.run(OmnicamNode, options=given, **SMALL | {'camera_model': ''})
+    heard, monitor = bench.listen(Image, 'panorama'), node.monitors['camera_info']
+    wrong = camera_info('fov'), camera_info('rational_polynomial', 200.0, [0.1] * 8)
+    for number, bad in enumerate([*wrong, camera_info(focal=0.0)], 1):
+        assert bench.publish_until(infos, bad, lambda n=number: len(monitor.refused) == n)
+    assert all(why.endswith('by a calibration_file') for why in monitor.refused)
+    assert bench.publish_until(infos, camera_info(), lambda: monitor.used)
+    assert bench.publish_until(infos, camera_info(focal=90.0), lambda: len(monitor.refused) == 4)
+    expected = Unwrapper(CameraConfig(), PANORAMA, FISHEYE)(raw_picture())
+    np.testing.assert_array_equal(pixels(answer(bench, heard, message(), images)), expected)
+    assert node.health()[2]['camera model'] == 'fisheye'
 
 
 def test_it_outlives_every_bad_image_and_counts_each(bench):
