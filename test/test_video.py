@@ -127,9 +127,11 @@ def test_without_the_library_or_a_codec_the_remedy_is_named(monkeypatch):
             ImageReader('CompressedImage').add(1, SimpleNamespace(format=format, data=b'0'))
 
 
-def record(path, kind, packets):
-    """A bag whose images are packets, with odometry."""
+def record(path, kind, packets, also=()):
+    """A bag whose images are packets, with odometry and images on other topics."""
     with BagWriter(path) as bag:
+        for topic in also:
+            bag.image(topic, START, scene(0), 'camera', 'jpeg')
         for number, data in packets:
             at = START + STEP * number
             message = blank(bag._types, kind)
@@ -142,6 +144,13 @@ def record(path, kind, packets):
             bag.odometry('/odom', at, (0.1 * number, 0, 0), (1, 0), (0, 0))
             bag.message(KINDS[kind], at, message)
     return path
+
+
+def test_single_images_are_preferred_to_video_beside_them(tmp_path):
+    kind = 'foxglove_msgs/msg/CompressedVideo'
+    with Bag(record(tmp_path / 'bag', kind, [(0, b'0')], ['/camera/compressed'])) as bag:
+        assert bag.find('image') == '/camera/compressed'
+        assert bag.find('image', '/video') == '/video'
 
 
 @pytest.mark.parametrize('kind', KINDS)

@@ -22,8 +22,9 @@ from sfa_localization.data.messages import read_odometry, read_planar, require_s
 
 IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 PACKET, VIDEO = 'ffmpeg_image_transport_msgs/msg/FFMPEGPacket', 'foxglove_msgs/msg/CompressedVideo'
-IMAGES = (IMAGE, COMPRESSED, PACKET, VIDEO)
-"""Types with an image of the camera."""
+VIDEOS = (PACKET, VIDEO)
+IMAGES = (IMAGE, COMPRESSED, *VIDEOS)
+"""Types with an image of the camera; those without video are preferred, as they need no PyAV."""
 ODOMETRY, IMU, TF = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu', 'tf2_msgs/msg/TFMessage'
 STAMPED_POSES = (
     'geometry_msgs/msg/PoseStamped',

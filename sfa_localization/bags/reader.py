@@ -94,6 +94,7 @@ class Bag:
             return self._named(wanted, topic)
         topics = [t for t in self.topics.values() if t.kind in wanted.usual and t.count]
         topics = [t for t in topics if not PUBLISHED.search(t.name)] or topics
+        topics = [t for t in topics if t.kind not in decoding.VIDEOS] or topics
         if not topics:
             kinds, has = _short(wanted.usual, ' or '), self._contents(wanted)
             raise BagError(f'{self.path}: has no {wanted.title} ({kinds}); {has}')
