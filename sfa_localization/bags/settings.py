@@ -19,7 +19,7 @@ class TopicNames(Settings):
     points_topic: str = setting(
         '', 'measured places: NavSatFix, PoseWithCovarianceStamped, PoseStamped or PointStamped'
     )
-    ground_truth: str = setting('', 'true poses, read for evaluation only')
+    ground_truth: str = setting('', 'true poses, or NavSatFix; read for evaluation only')
 
 
 @dataclass(frozen=True, slots=True)

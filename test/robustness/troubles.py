@@ -401,7 +401,7 @@ TROUBLES = {
         lambda: {IMAGES: unpacked}, RIGHT_M, 'images: 140 used', kinds={IMAGES: IMAGE},
     ),
     'odometry: starts anew after a pause': Trouble(
-        paused, (0.1, 0.1), 'odometry pauses once, first after 55.0 s',
+        paused, (0.08, 0.06), 'odometry pauses once, first after 55.0 s',
     ),
     'images: JPEGs cut off': Trouble(
         lambda: {IMAGES: cut_off}, RIGHT_M, 'images: .* cut-off JPEG'
