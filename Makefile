@@ -12,7 +12,7 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo reproduce study test robustness animation fuzz soak bench lint format colcon matrix clean
+.PHONY: help env demo reproduce study test robustness animation map fuzz soak bench lint format colcon matrix clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -40,6 +40,9 @@ robustness: $(READY)  ## run the tests of faults, write their tables, replay a d
 	PYTHONPATH=.:test $(PY) -m robustness --frozen
 	PYTHONPATH=.:test $(PY) -m robustness --live --lights
 
+map: $(READY)  ## draw the map of the demo: resource/map.png
+	PYTHONPATH=.:test $(PY) -m study.map_picture demo/model.npz demo/test resource/map.png
+
 animation: $(READY)  ## film the three nodes while the robot is kidnapped: resource/kidnapped.webp
 	PYTHONPATH=.:test $(PY) -m study.animation resource/kidnapped.webp
 
@@ -65,7 +68,7 @@ format: $(READY)  ## sort imports and format the code with ruff
 colcon:  ## colcon build and colcon test in a clean environment
 	PYTHON='$(PYTHON)' sh .ci/colcon $(PARALLEL) $(ARGS)
 
-matrix:  ## the tests on NumPy 1.26 with Python 3.12, and on the newest NumPy and Python
+matrix:  ## the tests on NumPy 1.26 with Python 3.12, on the newest NumPy and Python, and with ROS 2 Kilted
 	sh .ci/matrix $(ARGS)
 
 clean:  ## remove build results, but not the environment

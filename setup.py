@@ -19,6 +19,7 @@ COMMANDS = (
     'inspect',
     'calibrate',
     'filter',
+    'map',
     'tune',
     'config',
     'demo',
@@ -68,8 +69,12 @@ setup(
     extras_require={
         # Real ROS 2 Jazzy without a ROS installation (Linux x86-64).
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+        # The release after Jazzy, for `make matrix`.
+        'kilted': ['ros-kilted-rclpy[fastrtps]', 'ros-kilted-common-interfaces'],
         # The simulated garden of `simulate` and `demo`.
         'simulation': ['trimesh>=4.4', 'embreex>=2.17.7'],
+        # Images that are H.264 or H.265 video; older ones do not notice a lost packet of H.265.
+        'video': ['av>=16.0'],
         # The reference engine of `train`, made of MDP's nodes.
         'mdp': ['MDP==3.6'],
         # colcon finds the test runner by this name.
@@ -78,9 +83,9 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            f'{NAME} = {NAME}.cli:main',
-            *(f'{command} = {NAME}.cli:executable' for command in COMMANDS if IN_WORKSPACE),
-            *(f'{node} = {NAME}.nodes.entry:{node}' for node in NODES),
+            f'{NAME} = {NAME}.__main__:main',
+            *(f'{command} = {NAME}.__main__:executable' for command in COMMANDS if IN_WORKSPACE),
+            *(f'{node} = {NAME}.__main__:executable' for node in NODES),
         ],
     },
 )

@@ -5,6 +5,7 @@
 ros2 launch sfa_localization localization.launch.py model:=/path/to/model.npz
 """
 
+from functools import partial
 from pathlib import Path
 
 from launch import LaunchContext, LaunchDescription
@@ -28,13 +29,18 @@ def generate_launch_description() -> LaunchDescription:
     arguments = [
         DeclareLaunchArgument('model', description='model file, as `train` writes it'),
         DeclareLaunchArgument('config', default_value=parameters, description='parameter file'),
+        DeclareLaunchArgument(
+            'params_file', default_value='', description='the same, by the name that Nav2 uses'
+        ),
         DeclareLaunchArgument('namespace', default_value='', description='namespace of the nodes'),
         DeclareLaunchArgument('image', default_value='image_raw', description="camera's topic"),
         DeclareLaunchArgument(
             'panorama', default_value='', description='topic of panoramas, without an omnicam_node'
         ),
         DeclareLaunchArgument(
-            'image_transport', default_value='raw', description='raw, or compressed images'
+            'image_transport',
+            default_value='raw',
+            description='raw, compressed, ffmpeg or foxglove',
         ),
         DeclareLaunchArgument('odom', default_value='odom', description="odometry's topic"),
         DeclareLaunchArgument(
@@ -46,6 +52,11 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             'use_sim_time', default_value='false', description='time from /clock (bags, simulators)'
         ),
+        DeclareLaunchArgument(
+            'autostart', default_value='', description='false: a lifecycle manager starts the nodes'
+        ),
+        DeclareLaunchArgument('log_level', default_value='info', description='of the nodes'),
+        DeclareLaunchArgument('rviz', default_value='false', description='start RViz too'),
         DeclareLaunchArgument(
             'respawn', default_value='true', description='start a node again that has died'
         ),
@@ -59,8 +70,12 @@ def _nodes(context: LaunchContext) -> list:
     launch itself would go on with every default.
     """
     given = context.launch_configurations
-    if not Path(given['config']).is_file():
-        raise FileNotFoundError(f'config:={given["config"]}: there is no such parameter file')
+    file = given['params_file'] or given['config']
+    if not Path(file).is_file():
+        raise FileNotFoundError(f'config:={file}: there is no such parameter file')
+    # Without the argument, the parameter file decides.
+    start = {'autostart': given['autostart'] == 'true'} if given['autostart'] else {}
+    node = partial(_node, file, start)
     transport = {'image_transport': given['image_transport']}
     model = {'model': given['model']}
     image, panorama = given['image'], given['panorama']
@@ -68,21 +83,35 @@ def _nodes(context: LaunchContext) -> list:
     # As Nav2 does, so that robots with frames of the same names do not meet on /tf.
     odometry = [('odom', given['odom']), ('/tf', given['tf'])]
     if panorama:
-        seeing = [_node('sfa_node', [('panorama', panorama)], {**model, **transport})]
+        seeing = [node('sfa_node', [('panorama', panorama)], {**model, **transport})]
     else:
-        seeing = [_node('omnicam_node', images, transport), _node('sfa_node', [], model)]
-    ekf = _node('ekf_node', odometry, {}, condition=IfCondition(given['ekf']))
-    return [PushROSNamespace(given['namespace']), *seeing, ekf]
+        seeing = [node('omnicam_node', images, transport), node('sfa_node', [], model)]
+    ekf = node('ekf_node', odometry, {}, condition=IfCondition(given['ekf']))
+    return [PushROSNamespace(given['namespace']), *seeing, ekf, _rviz(given)]
 
 
-def _node(name: str, remappings: list, parameters: dict, **options: object) -> Node:
+def _rviz(given: dict) -> Node:
+    layout = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config', 'localization.rviz'])
+    return Node(
+        package='rviz2',
+        executable='rviz2',
+        arguments=['-d', layout],
+        remappings=[('/tf', given['tf'])],
+        condition=IfCondition(given['rviz']),
+    )
+
+
+def _node(
+    file: str, start: dict, name: str, remappings: list, parameters: dict, **options: object
+) -> Node:
     sim_time = ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
     return Node(
         package=PACKAGE,
         executable=name,
         name=name,
         output='screen',
-        parameters=[LaunchConfiguration('config'), {'use_sim_time': sim_time, **parameters}],
+        arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')],
+        parameters=[file, {'use_sim_time': sim_time, **start, **parameters}],
         remappings=remappings,
         respawn=LaunchConfiguration('respawn'),
         respawn_delay=RESPAWN_DELAY_S,

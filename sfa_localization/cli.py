@@ -24,6 +24,7 @@ COMMANDS = {
     'evaluate': 'Compare a model, alone and fused with odometry, with the ground truth of a drive.',
     'play': 'Replay a bag through ROS, with the types, QoS and pace of the recording.',
     'inspect': 'Report the contents and defects of bags, and whether they are enough to train on.',
+    'map': 'Write where the robot drove in training as a map for Nav2.',
     'calibrate': 'Detect the mirror in images, or read a calibration file; write parameters.',
     'filter': 'Fuse a log of odometry and positions, without ROS, as the live filter would.',
     'tune': "Find the filter's noise parameters from bags; write them into a parameter file.",

@@ -22,7 +22,7 @@ from sfa_localization.camera.settings import (
     WatchConfig,
 )
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.data.files import atomic_write, read_regular
+from sfa_localization.data.files import atomic_write, read_text
 from sfa_localization.data.plain_yaml import LONGEST, load_yaml
 from sfa_localization.data.rejections import quoted
 from sfa_localization.data.settings import Settings, nearest
@@ -87,8 +87,9 @@ def load_section(path: Path, section: str) -> dict[str, Any]:
         if node in _WILDCARDS:
             _check_names(values, all_names(), f'{path}: {key}')
             shared.update(values)
-        elif node == section:
-            _check_names(values, items, f'{path}: {section}')
+        else:
+            _check_names(values, _items(node), f'{path}: {node}')
+        if node == section:
             robots.setdefault(namespace, {}).update(values)
     given = {**shared, **_merged(robots, f'{path}: {section}')}
     return {
@@ -163,10 +164,7 @@ def _sections(path: Path) -> dict[str, dict[str, Any]]:
     """
     try:
         # Not from a pipe, which would be empty for the next section.
-        document = load_yaml(read_regular(path, LONGEST).decode())
-    except (UnicodeDecodeError, OSError) as error:
-        reason = error.strerror or error if isinstance(error, OSError) else error.reason
-        raise ConfigError(f'{path}: cannot be read: {reason}') from None
+        document = load_yaml(read_text(path, LONGEST, ConfigError))
     except ValueError as error:
         raise ConfigError(f'{path}: {error}') from None
     if document is None:

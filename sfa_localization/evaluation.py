@@ -8,7 +8,9 @@ the training drives and applied unchanged to the test drive; the error is the Eu
 
 from __future__ import annotations
 
+import logging
 import math
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,11 +48,18 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
 from sfa_localization.localizer import Localizer
+from sfa_localization.metric.dead_reckoning import OdometryTrack
+from sfa_localization.metric.motion_check import MotionCheck, check_motion
+from sfa_localization.metric.motion_clocks import Drift
+from sfa_localization.metric.motion_truth import TruePoses, true_poses
+from sfa_localization.metric.settings import SegmentConfig
 from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 
+logger = logging.getLogger(__name__)
 Scores = dict[str, dict[str, Any]]
+_CLOCK_OR_FOLLOWING = re.compile('clock runs|^images follow')
 _TRUTH_TOLERANCE_NS = 500_000_000
 WRONG_M = 1.0
 """Position error from which a filter that says LOCALISED is wrong."""
@@ -71,10 +80,13 @@ class Evaluation:
     features: Array
     aligned_on: str
     transform: RigidTransform
+    corrections: tuple[str, ...] = ()
+    """What was corrected of the ground truth of each drive, in sentences."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers: one entry per estimate, and the counts."""
-        return {**self.scores, 'counts': self.counts, 'aligned_on': self.aligned_on}
+        notes = {'aligned_on': self.aligned_on, 'corrections': list(self.corrections)}
+        return {**self.scores, 'counts': self.counts, **notes}
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,16 +99,30 @@ class _Localized:
     """
 
     run: Run
-    truth: Trajectory
+    true: TruePoses
     tracks: dict[str, FilterTrack]
     features: Array
     localised: Mask
     counts: dict[str, Any]
+    sentences: tuple[str, ...]
+    """What was corrected, of the truth and of clocks, and how images follow the robot."""
+
+    @property
+    def truth(self) -> Trajectory:
+        """True poses of base_link."""
+        return self.true.poses
 
     @property
     def images(self) -> Trajectory:
         """Poses of the usable images in the map."""
         return self.tracks['sfa'].poses
+
+    def estimates(self, transform: RigidTransform) -> dict[str, Trajectory]:
+        """Poses in the frame of the truth, without headings if the truth has none."""
+        poses = {'odometry': odometry_from_start(self.truth, self.run)}
+        poses |= {name: moved(track.poses, transform) for name, track in self.tracks.items()}
+        axes = [1.0, 1.0, 1.0 if self.true.headings else np.nan]
+        return {name: Trajectory(p.stamps_ns, p.poses * axes) for name, p in poses.items()}
 
 
 @one_core()
@@ -119,26 +145,35 @@ def evaluate(
     smoothed after the drive. Unusable images count as skipped observations. Raises BagError or
     DataError, also without ground truth.
     """
-    recipe = as_live(recipe or Recipe(), model.panorama)
-    training_drives = [
-        _localized(path, Localizer(model, config, watch), _with_topics_of(path, recipe), progress)
-        for path in align_bags
-    ]
+    recipe = as_live(recipe or Recipe(), model.panorama, model.mount_rpy)
+    recipe, training_drives = replace(recipe, origin=model.origin), list[_Localized]()
+    for path in align_bags:
+        here = _with_topics_of(path, recipe)
+        training_drives.append(_localized(path, Localizer(model, config, watch), here, progress))
+        recipe = replace(recipe, origin=training_drives[-1].run.origin)
     kind = Smoother if smooth else PoseFilter
     drive = _localized(bag, Localizer(model, config, watch, kind), recipe, progress)
-    aligned_on = 'nothing: the transform was given'
+    aligned_on = 'nothing: coordinates of the map'
     if transform is None:
         aligned_on = ', '.join(map(str, align_bags or [bag]))
         transform = fit_transform(*((d.truth, d.images) for d in training_drives or [drive]))
-    estimates = {'odometry': odometry_from_start(drive.truth, drive.run)}
-    estimates |= {name: moved(track.poses, transform) for name, track in drive.tracks.items()}
+    estimates = drive.estimates(transform)
+    scores = _scores(drive, estimates, rotation(transform.yaw_rad))
+    counts = {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])}
+    drives = *training_drives, drive
+    corrections = tuple(f'{d.run.name}: {text}' for d in drives for text in d.sentences)
+    return Evaluation(
+        drive.truth, estimates, scores, counts, drive.features, aligned_on, transform, corrections
+    )
+
+
+def _scores(drive: _Localized, estimates: Mapping[str, Trajectory], turn: Array) -> Scores:
+    """Errors and calibration of the estimates; `turn` (2, 2) leads from the map to the truth."""
     scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
-    turn = rotation(transform.yaw_rad)
     for name, track in drive.tracks.items():
         scores[name] |= calibration(drive.truth, estimates[name], turn, track.covariances)
         scores[name]['similarity'] = similarity(drive.truth, estimates[name])
-    counts = {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])}
-    return Evaluation(drive.truth, estimates, scores, counts, drive.features, aligned_on, transform)
+    return scores
 
 
 def observed(
@@ -149,6 +184,11 @@ def observed(
     Raises BagError or DataError, also without a wanted truth.
     """
     run = _read(bag, recipe, progress, want_truth)
+    if want_truth:
+        _, true = _compared(run, list(headings(run.panoramas)))
+        for text in true.sentences:
+            logger.warning('%s: %s', run.name, text)
+        run = replace(run, ground_truth=true.poses)
     return run, list(_observations(run, observer, progress))
 
 
@@ -177,10 +217,28 @@ def _read(bag: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Run:
     return run
 
 
+def _compared(run: Run, turns: Sequence[float]) -> tuple[MotionCheck, TruePoses]:
+    """The comparison of the sources of motion, and the poses of base_link by the ground truth, as
+    compared with the odometry; `turns` are the headings of the images. Raises DataError for the
+    truth of another drive.
+    """
+    assert run.ground_truth is not None
+    images = run.panoramas.stamps_ns, np.array(turns)
+    open_loop = OpenLoop.of(run.odometry.twists).repeats
+    check = check_motion(run.odometry, images, run.yaw_rate, commands=open_loop)
+    track = OdometryTrack.of(check.odometry, SegmentConfig(), check.gyro)
+    try:
+        true = true_poses(run.ground_truth, track, check.confirmed, open_loop)
+    except DataError as error:
+        raise DataError(f'{run.name}: {error}') from None
+    return check, true
+
+
 def _localized(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Localized:
     """Run model and filter over a bag. Raises BagError or DataError."""
     run, fused = _read(bag, recipe, progress), localizer.filter
-    assert run.ground_truth is not None
+    turns = list(headings(run.panoramas))
+    check, true = _compared(run, turns)
     observations, levels = list[Observation](), dict[int, Level]()
     states, localised = list[State](), list[bool]()
     images = run.panoramas.stamps_ns, _observations(run, localizer.observer, progress)
@@ -195,15 +253,18 @@ def _localized(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) 
     usable = [observation for observation in observations if not observation.problem]
     if not usable:
         raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
-    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
+    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, turns)
     counts = _counts(run, observations, levels, fused, clock)
+    late = check.image_drift or Drift(0, clock.delay_ns * 1e-9, 0.0)
     if OpenLoop.of(run.odometry.twists).repeats:  # the robot is late, not the images
-        clock = CameraClock()
-    tracks = {'sfa': _track(usable, clock), 'ekf': FilterTrack.of(states)}
+        late = Drift(0, 0.0, 0.0)
+    tracks = {'sfa': _track(usable, late), 'ekf': FilterTrack.of(states)}
     if isinstance(fused, Smoother):
         tracks['smoothed'] = FilterTrack.of(fused.smoothed())
     features = np.array([observation.slow_features for observation in usable])
-    return _Localized(run, run.ground_truth, tracks, features, np.array(localised, bool), counts)
+    said = [text for text in check.corrected + check.wrong if _CLOCK_OR_FOLLOWING.search(text)]
+    sentences = (*said, *true.sentences)
+    return _Localized(run, true, tracks, features, np.array(localised), counts, sentences)
 
 
 def _counts(
@@ -237,9 +298,10 @@ def _seconds_since_last(stamps_ns: Stamps) -> Array:
     return np.minimum(np.diff(stamps_ns, prepend=stamps_ns[:1]) * 1e-9, COAST_S)
 
 
-def _track(usable: Sequence[Observation], clock: CameraClock) -> FilterTrack:
+def _track(usable: Sequence[Observation], clock: Drift) -> FilterTrack:
     """The poses of single images, at the times when they were taken by `clock`."""
-    stamps = np.array([image.stamp_ns for image in usable], np.int64) - clock.delay_ns
+    stamps = np.array([image.stamp_ns for image in usable], np.int64)
+    stamps -= clock.late_ns(stamps)
     poses = np.array([[*image.position, image.yaw] for image in usable])
     return FilterTrack(Trajectory(stamps, poses), np.array([image.covariance for image in usable]))
 

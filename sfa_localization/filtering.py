@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections import Counter
@@ -16,7 +17,7 @@ import numpy as np
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.files import atomic_write, read_regular
+from sfa_localization.data.files import atomic_write, read_text
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.progress import progress_over
 from sfa_localization.data.rejections import short_line
@@ -38,12 +39,12 @@ _SEPARATOR = re.compile(r'\s*[,;]\s*|\s+')
 class Table(NamedTuple):
     """Rows of a log in the order of time: stamps (N,), other columns (N, K) with NaN where empty.
 
-    `skipped` is the number of rows that could not be used; `source` names the file.
+    `skipped` are the numbers of the lines that could not be used; `source` names the file.
     """
 
     stamps_ns: Stamps
     values: Array
-    skipped: int = 0
+    skipped: tuple[int, ...] = ()
     source: str = 'memory'
 
 
@@ -67,14 +68,12 @@ def read_table(path: Path | str, names: Sequence[str]) -> Table:
     Cells are separated by commas or spaces. A line above them may name the columns in any order;
     the time may be `stamp_ns`. Lines that begin with # are comments. Raises DataError.
     """
-    try:
-        text = read_regular(path, LARGEST_LOG).decode('utf-8-sig')
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f'{path}: cannot be read: {error}') from None
-    lines = [line.strip() for line in text.splitlines()]
-    rows = [_SEPARATOR.split(line) for line in lines if line and line[0] != '#']
+    lines = [line.strip() for line in read_text(path, LARGEST_LOG, DataError).splitlines()]
+    numbers = [k for k, line in enumerate(lines, 1) if line and line[0] != '#']
+    rows = [_SEPARATOR.split(lines[number - 1]) for number in numbers]
     named = bool(rows) and math.isnan(_number(rows[0], 0))
-    header = [cell.strip('"') for cell in rows.pop(0)] if named else list(names)
+    header = [cell.strip('"') for cell in rows[0]] if named else list(names)
+    rows, numbers = rows[named:], numbers[named:]
     stamp, scale = ('stamp_ns', 1) if 'stamp_ns' in header else (names[0], SECOND_NS)
     for name in (stamp, *names[1:3]):
         if name not in header:
@@ -82,15 +81,14 @@ def read_table(path: Path | str, names: Sequence[str]) -> Table:
     first = header.index(stamp)
     at = [header.index(name) if name in header else len(header) for name in names[1:]]
     read = [(_nanoseconds(row, first, scale), [_number(row, k) for k in at]) for row in rows]
-    used = [
-        (ns, cells) for ns, cells in read if ns is not None and math.isfinite(cells[0] + cells[1])
-    ]
-    if not used:
+    right = [ns is not None and math.isfinite(cells[0] + cells[1]) for ns, cells in read]
+    if not any(right):
         wanted = f'{stamp}, {names[1]} and {names[2]}'
         raise DataError(f'{path}: none of its {len(rows)} rows has {wanted}, in these units')
-    used.sort(key=lambda row: row[0])
-    stamps = np.array([ns for ns, _ in used], np.int64)
-    return Table(stamps, np.array([cells for _, cells in used]), len(rows) - len(used), str(path))
+    used = sorted(itertools.compress(read, right), key=lambda row: row[0] or 0)
+    stamps, values = (np.array(column) for column in zip(*used, strict=True))
+    skipped = tuple(number for number, good in zip(numbers, right, strict=True) if not good)
+    return Table(stamps.astype(np.int64), values, skipped, str(path))
 
 
 def _number(row: list[str], column: int) -> float:

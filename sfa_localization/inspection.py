@@ -7,8 +7,9 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,10 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 from sfa_localization.bags import decoding
 from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S
 from sfa_localization.bags.motion_arrays import to_yaw_rate
-from sfa_localization.bags.reader import KINDS, Bag
+from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
-from sfa_localization.bags.topic_stream import Stream
-from sfa_localization.camera import kinds
+from sfa_localization.bags.topic_stream import Stream, clock_offset
+from sfa_localization.camera import body, kinds
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import VisualGyro
@@ -36,9 +37,10 @@ from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
 from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
+from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.keyframes.closures import STRETCH_M, Textures, driven
 from sfa_localization.keyframes.leveling import tilt_pairs
-from sfa_localization.keyframes.texture import quantized, texture
+from sfa_localization.keyframes.texture import channels, quantized, texture
 from sfa_localization.metric.drive_check import ROUTE, is_single_route
 from sfa_localization.metric.motion_check import MotionCheck, check_motion
 from sfa_localization.metric.motion_sources import IMAGES, POSE, late
@@ -58,7 +60,7 @@ EVEN, EVEN_SHARE = 3.0, 0.9  # a topic is periodic if this share of intervals is
 MAX_REPEATED = 0.05  # share of images that repeat the last one; more are reported
 STANDING_M = 0.02  # between images of a robot that stands
 GRID = 100  # points per axis at which coverage is evaluated
-TILT_IMAGES, TILT_PAIRS = 400, 50  # images compared for the ground's tilt, and pairs it takes
+TILT_PAIRS = 50  # that show the tilt of the ground
 DARK = 12.0  # mean gray level of 255 below which an image is dark
 
 # Pairs of images at a place with different headings show the lever arm of the camera.
@@ -140,11 +142,13 @@ class TopicReport:
 
 @dataclass
 class BagReport:
-    """All findings about a bag; `lacks` are the reasons why it is not enough to train on.
+    """All findings about a bag; `lacks` are the reasons why it is not enough to train on; for those
+    `of_drive`, other drives may make up.
 
     `error` says why it cannot be read at all. `samples` are images from all over the drive, and
-    `camera` the kind of camera that they show. `places` (M, 3) are the poses of images with
-    `odometry`; `motion` compares odometry, images and gyroscope; `tilt` is that of the ground.
+    `camera` the kind of camera that they show. `drives` are the poses (M, 3) of images with
+    `odometry` in each unbroken part of it; `motion` compares odometry, images and gyroscope; `tilt`
+    is that of the ground; `bodies` hide the view.
     """
 
     path: str
@@ -153,14 +157,29 @@ class BagReport:
     problems: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     lacks: list[str] = field(default_factory=list)
+    of_drive: list[str] = field(default_factory=list)
     image_topic: str = ''
     camera: kinds.CameraKind | None = None
     samples: list[Image] = field(default_factory=list)
     odometry_topic: str = ''
     odometry: Odometry | None = None
-    places: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    drives: list[Array] = field(default_factory=list)
     motion: MotionCheck | None = None
     tilt: str = ''
+    bodies: list[body.Body] = field(default_factory=list)
+
+    @property
+    def length_m(self) -> float:
+        """The way by the unbroken parts of the odometry."""
+        if self.odometry is None:
+            return 0.0
+        steps = np.hypot(*np.diff(self.odometry.poses[:, :2], axis=0).T)
+        return float(steps[np.diff(self.odometry.part) == 0].sum())
+
+    @property
+    def places(self) -> Array:
+        """Poses (M, 3) of all images with odometry."""
+        return np.concatenate([np.zeros((0, 3)), *self.drives])
 
     @property
     def facts(self) -> dict[str, str]:
@@ -169,11 +188,13 @@ class BagReport:
         if self.camera is not None:
             facts['images'] = str(self.camera)
         if self.odometry is not None:
+            area = max(map(hull_area, self.drives), default=0.0)
+            along = max(map(directions, self.drives), default=0)
             facts['drive'] = (
-                f'{path_length(self.odometry.poses):.0f} m by {self.odometry_topic}, '
-                f'{len(self.places)} images over {hull_area(self.places):.0f} m2, '
+                f'{self.length_m:.0f} m by {self.odometry_topic}, '
+                f'{len(self.places)} images over {area:.0f} m2, '
                 f'{spacing(self.places):.2f} m apart, '
-                f'along {directions(self.places)} of {SECTORS} directions'
+                f'along {along} of {SECTORS} directions'
             )
             stops_s = (stops(self.odometry) - self.odometry.stamps_ns[0]) * 1e-9
             stood = [f'stop {k} at {a:.1f} to {b:.1f} s' for k, (a, b) in enumerate(stops_s, 1)]
@@ -210,9 +231,10 @@ class BagReport:
         lines += [f'  {line}' for line in self.motion.as_text()] if self.motion else []
         lines += [f'  problem: {problem}' for problem in self.problems]
         lines += [f'  note: {note}' for note in self.notes]
-        if entry := self.camera and self.camera.entry(self.path):
+        camera = self.camera.entry(self.path) if self.camera else ''
+        if entries := [entry for entry in (camera, body.blind_sectors(self.bodies)) if entry]:
             lines += ['  start my_localization.yaml with:', '    /**/omnicam_node:']
-            lines += ['      ros__parameters:', f'        {entry}']
+            lines += ['      ros__parameters:', *(f'        {entry}' for entry in entries)]
         lines += [f'  not enough to train on: {lack}' for lack in self.lacks]
         return '\n'.join(lines if self.lacks else [*lines, '  enough to train on'])
 
@@ -237,13 +259,16 @@ def inspect(
         report.odometry_topic = _topic_of(bag, 'odometry', topics.odometry, report)
         _Survey(bag, report, topics, clockwise).fill()
         report.problems, report.notes = bag.problems, bag.recording.notes
+    report.notes += body.sentences(report.bodies)
     if _single_route(report.places):
         report.notes.append(ROUTE)
     if path_length(report.places) >= 1.0 and not headings_differ(report.places):
         report.notes.append(NO_LEVER_ARM)
-    if report.lacks and report.motion:
-        report.lacks += report.motion.wrong
-    report.lacks += [] if report.lacks else lacks(report, config or InspectionConfig())
+    if report.lacks:
+        report.lacks += report.motion.wrong if report.motion else []
+        return report
+    report.of_drive = list(lacks_of_drives(report.drives, config or InspectionConfig()))
+    report.lacks = [*lacks(report, config or InspectionConfig()), *report.of_drive]
     return report
 
 
@@ -270,7 +295,7 @@ class _Survey:
         self._gyro, self._frozen, self._repeats = VisualGyro(clockwise), FrozenWatch(), 0
         self._sizes: Counter[tuple[int, ...]] = Counter()
         count = bag.topics[self._image].count if self._image else 0
-        self._every, self._tilt_every = max(count // SAMPLES, 1), -(-count // TILT_IMAGES) or 1
+        self._every, self._tilt_every = max(count // SAMPLES, 1), -(-count // body.IMAGES) or 1
         self._sphere = PanoramaConfig(clockwise=clockwise).sphere
         self._textures: dict[int, NDArray[np.int8]] = {}
         self._rolls_and_pitches: list[tuple[float, float]] = []
@@ -288,7 +313,18 @@ class _Survey:
             self._report.camera = kinds.CameraKind(*kinds.guess_geometry(alike), width, height)
         for stream in streams:
             if stream.topic == self._odometry and self._values[self._odometry]:
+                offsets = [self._by_clock_of(stream, other) for other in streams]
                 self._drive(stream)
+                if self._report.motion is not None:
+                    self._report.motion.corrected += filter(None, offsets)
+
+    def _by_clock_of(self, odometry: Stream, stream: Stream) -> str:
+        """Stamp images and yaw rates by the clock of the odometry; a sentence if theirs differs."""
+        name = {self._image: 'images', self._imu: 'gyroscope'}.get(stream.topic, '')
+        ahead_ns, text = clock_offset(name, stream, odometry) if name else (0, '')
+        values = self._values[stream.topic]
+        self._values[stream.topic] = [(stamp_ns - ahead_ns, value) for stamp_ns, value in values]
+        return text
 
     def _stream(self, name: str) -> Stream:
         if name == self._odometry:
@@ -299,18 +335,16 @@ class _Survey:
             return self._bag.stream(name, self._take, required=False)
         if name == self._imu:
             return self._bag.stream(name, self._yaw_rate, required=False)
-        is_image = self._bag.topics[name].kind in KINDS['image'].usual
         # Other images are decoded to detect damage, and not kept.
-        check = (lambda m: decoding.image_of(m).shape) if is_image else (lambda _: None)
-        return self._bag.stream(name, check, required=False)
+        return self._bag.stream(name, lambda _: None, required=False)
 
-    def _take(self, message: Any) -> tuple[float, NDArray[np.int8] | None]:
-        """Decode an image, and keep a sample now and then.
+    def _take(self, image: Image) -> tuple[float, NDArray[np.int8] | None]:
+        """Keep a sample of the images now and then.
 
         Returns the turn of the camera since the first image, rad, and a small texture of the image,
         None if it repeats the last one.
         """
-        image, samples = decoding.image_of(message), self._report.samples
+        samples = self._report.samples
         new = self._frozen.add(image)
         self._repeats += not new
         if self._sizes.total() % self._every == 0 and len(samples) < SAMPLES:
@@ -354,36 +388,62 @@ class _Survey:
     def _drive(self, stream: Stream) -> None:
         """Fill in the path, the tilt, and the comparison with images and gyroscope."""
         report, camera = self._report, self._report.camera
-        odometry = self._bag.to_odometry(stream, self._values[self._odometry])
+        try:
+            odometry = self._bag.to_odometry(stream, self._values[self._odometry])
+        except BagError as error:
+            report.lacks.append(str(error).removeprefix(f'{self._bag.path}: '))
+            return
         images = self._values.get(self._image, [])
         stamps = np.array([stamp for stamp, _ in images], np.int64)
-        near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
-        report.odometry, report.places = odometry, odometry.trajectory.at(near)
         yaw = np.array([yaw for _, (yaw, _) in images], float)
         new = [(stamp, texture) for stamp, (_, texture) in images if texture is not None]
         views = (np.array([s for s, _ in new]), np.stack([t for _, t in new])) if new else None
+        sampled = self._sampled(driven(odometry, stamps))
         if self._rolls_and_pitches:
             tilt = np.degrees(np.std(self._rolls_and_pitches, 0).mean())
             report.tilt = f'tilts the robot by {tilt:.1f} degrees'
         else:
-            report.tilt = self._camera_tilt(driven(odometry, stamps))
+            report.tilt = self._camera_tilt(sampled) if sampled is not None else ''
         turns = (stamps, yaw) if camera is not None and camera.shows_turns else None
         rates = self._values.get(self._imu, [])
         gyro = to_yaw_rate(sorted(rates)) if rates else None
         is_panorama = camera is not None and camera.is_panorama
-        report.motion = check_motion(odometry, turns, gyro, is_panorama, views)
+        commands = OpenLoop.of(odometry.twists).repeats
+        report.motion = check_motion(odometry, turns, gyro, is_panorama, views, commands)
+        report.bodies = self._bodies(sampled, stamps)
+        near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
+        places, broken = odometry.trajectory.at(near), report.motion.odometry
+        part, of_image = (
+            broken.part[np.searchsorted(broken.stamps_ns[1:-1], at, 'right')]
+            for at in (odometry.stamps_ns, near)
+        )
+        report.odometry = replace(odometry, part=part)
+        report.drives = [places[of_image == number] for number in np.unique(of_image)]
 
-    def _camera_tilt(self, path_m: Array) -> str:
-        """How the ground tilts the camera, by pairs of images after `path_m` (N,) of driving."""
+    def _bodies(self, sampled: Textures | None, stamps: Stamps) -> list[body.Body]:
+        """What hides the view, by images at stamps (N,) that turn with the robot."""
+        motion = self._report.motion
+        pair = motion and motion.pair(POSE, IMAGES)
+        if sampled is None or motion is None or (pair and pair.independent):
+            return []
+        headings = motion.odometry.trajectory.at(stamps[sampled.images])[:, 2]
+        light = channels(sampled.textures.shape[1])[0]
+        return body.bodies(sampled.textures[:, light], headings, self._sphere)
+
+    def _sampled(self, path_m: Array) -> Textures | None:
+        """Textures of images after `path_m` (N,) of driving; None without panoramas of one size."""
         if len({textures.shape for textures in self._textures.values()}) != 1:
-            return ''
+            return None
         rows = np.array([number for number in self._textures if number < len(path_m)])
         textures = np.concatenate([self._textures[number] for number in rows.tolist()])
-        images = Textures(textures, rows, np.zeros_like(rows), path_m[rows])
+        return Textures(textures, rows, np.zeros_like(rows), path_m[rows])
+
+    def _camera_tilt(self, images: Textures) -> str:
+        """How the ground tilts the camera, by pairs of images."""
         pairs = tilt_pairs(images, self._sphere)
         if len(pairs.tilt) < TILT_PAIRS:
             return ''
-        squares = np.abs(pairs.tilts(np.zeros(len(rows), complex))) ** 2
+        squares = np.abs(pairs.tilts(np.zeros(len(images.images), complex))) ** 2
         tilt = math.degrees(math.sqrt(float(squares.mean()) / 2))  # along each axis
         return f'tilts the camera by at least {tilt:.1f} degrees'
 
@@ -449,9 +509,8 @@ def headings_differ(places: Array) -> bool:
     return int((again & turned).sum()) >= MIN_PAIRS
 
 
-def sparse_lanes(places: Array, reach_m: float) -> list[str]:
-    """A sentence if too little of the ground is near an image, for images at places (N, >= 2)."""
-    share = covered_share(places, reach_m)
+def sparse_lanes(share: float, reach_m: float) -> list[str]:
+    """A sentence if a small share of the ground is near an image."""
     if share >= MIN_COVERED:
         return []
     return [
@@ -470,7 +529,7 @@ def too_sparse(places: Array, most_m: float) -> list[str]:
 
 
 def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
-    """The reasons why a bag is not enough to train on, each with its remedy."""
+    """The reasons why a bag cannot be trained on with any others, each with its remedy."""
     if report.camera is None or report.motion is None:
         parts = ('images', report.camera), ('odometry', report.motion)
         yield f'no {" and no ".join(name for name, part in parts if part is None)} could be read'
@@ -481,8 +540,6 @@ def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
         yield f'images are stamped {late(pair.late_s)}: synchronize the clocks'
     used = len(report.places)
     (recorded,) = (topic.count for topic in report.topics if topic.name == report.image_topic)
-    if used < config.min_pictures:
-        yield f'{used} images with odometry are few: drive until there are {config.min_pictures}'
     if used < (1 - MAX_WITHOUT_ODOMETRY) * recorded:
         yield (
             f'{recorded - used} of {recorded} images have no odometry nearby: '
@@ -492,21 +549,49 @@ def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
         yield report.camera.lack
     if float(np.mean([sample.mean() for sample in report.samples])) < DARK:
         yield 'the images are dark: open the lens or wait for daylight'
-    whole = not np.ptp(report.motion.odometry.part)
-    yield from _lacks_of_drive(report.places, config, whole) if used > 1 else ()
+    yield from too_sparse(report.places, config.max_spacing)
 
 
-def _lacks_of_drive(places: Array, config: InspectionConfig, whole: bool) -> Iterator[str]:
-    """What a drive with images at places (N, 3) lacks; the odometry has no breaks if `whole`."""
-    if path_length(places) < 1.0:
+def lacks_of_drives(drives: Sequence[Array], config: InspectionConfig) -> Iterator[str]:
+    """What drives with images at places (M, 3) lack together, each with its remedy.
+
+    Each drive has a frame of its own, and how they lie to each other is unknown before training:
+    only what the best arrangement lacks is named. One drive may cross the lanes of another: those
+    of two days, along and across, gave a map of 0.06 m.
+    """
+    used = sum(map(len, drives))
+    if 0 < used < config.min_pictures:
+        yield f'{used} images with odometry are few: drive until there are {config.min_pictures}'
+    if used and sum(map(path_length, drives)) < 1.0:
         yield 'the robot did not move: drive it over the area'
+    areas = [places for places in drives if len(places) > 1 and path_length(places) >= 1.0]
+    if all(map(_single_route, areas)):
         return
-    yield from too_sparse(places, config.max_spacing)
-    if not whole or _single_route(places):
-        return
-    yield from sparse_lanes(places, config.reach)
-    if directions(places) < MIN_DIRECTIONS:
+    covered = [hull_area(places) * covered_share(places, config.reach) for places in areas]
+    yield from sparse_lanes(sum(covered) / max(map(hull_area, areas)), config.reach)
+    if len(areas) == 1 and directions(areas[0]) < MIN_DIRECTIONS:
         yield (
-            f'driven along {directions(places)} of {SECTORS} directions: '
+            f'driven along {directions(areas[0])} of {SECTORS} directions: '
             'cross the area lengthwise, crosswise and diagonally'
         )
+
+
+def lacks_together(reports: Sequence[BagReport], config: InspectionConfig) -> list[str]:
+    """The reasons why bags are not enough to train one model on all of them."""
+    names: dict[str, list[str]] = {}
+    for report in reports:
+        every = [report.error.removeprefix(f'{report.path}: ')] if report.error else report.lacks
+        for lack in every:
+            names.setdefault(lack, []).extend([report.path] * (lack not in report.of_drive))
+    texts = [f'{", ".join(paths)}: {lack}' for lack, paths in names.items() if paths]
+    images = [(r, topic) for r in reports for topic in r.topics if topic.name == r.image_topic]
+    for (first, one), (second, other) in combinations(images, 2):
+        if one.count and np.array_equal(one.stamps_ns, other.stamps_ns):
+            texts.append(f'{first.path} and {second.path} are the same drive: name it once')
+    sizes = {(r.camera.width, r.camera.height) for r in reports if r.camera}
+    sizes = {size for size in sizes if looks_like_panorama(*size[::-1])}
+    if len(sizes) > 1:
+        listed = ', '.join(f'{width}x{height}' for width, height in sorted(sizes))
+        texts.append(f'panoramas of different sizes ({listed}): train on one size')
+    drives = [places for report in reports for places in report.drives]
+    return [*texts, *lacks_of_drives(drives, config)]

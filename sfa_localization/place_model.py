@@ -18,10 +18,10 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.array_files import Arrays, read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import LocalizationError, ModelError
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.rig import Rig
-from sfa_localization.data.run import Image
+from sfa_localization.data.run import Image, Origin
 from sfa_localization.data.threads import one_core
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.light import Conditions
@@ -29,6 +29,7 @@ from sfa_localization.keyframes.location import Location, hypotheses, located
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE, Observation
 from sfa_localization.keyframes.regression import Fit
 from sfa_localization.keyframes.upright import UprightImage, upright
+from sfa_localization.metric.driven_ground import DrivenGround
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.turned_maps import TurnedMaps
 from sfa_localization.sfa.image_features import (
@@ -47,7 +48,7 @@ from sfa_localization.sfa.network import (
 )
 
 FORMAT = 'sfa_localization place model'
-VERSION = 15
+VERSION = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,19 +67,24 @@ class PlaceModel:
     """Network, metric map and keyframes, learned from one place.
 
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the figures
-    of merit of the training, `error_correlation` that of neighboring images, `rig` the robot. Map
-    and keyframes hold places of the camera. The map reads `turned` maps, or slow features where
-    there are none.
+    of merit of the training, `error_correlation` that of neighboring images, `rig` the robot, and
+    `ground` where it drove. Map and keyframes hold places of the camera. The map reads `turned`
+    maps, or slow features where there are none. Where the robot hides its view, pixels (H, W)
+    repeat those of `repeated`. `mount_rpy`, degrees, are the angles of a camera that gives
+    panoramas, by which these were resampled; () if they were not.
     """
 
     network: Network
     metric: MetricMap
     panorama: PanoramaConfig
     keyframes: Keyframes
+    ground: DrivenGround
     turned: TurnedMaps | None = None
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
     rig: Rig = field(default_factory=Rig)
+    repeated: Indices | None = None
+    mount_rpy: tuple[float, ...] = ()
 
     def locate(self, panorama: Image) -> Observation:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
@@ -91,8 +97,16 @@ class PlaceModel:
     @one_core()
     def locate_all(self, panoramas: Image) -> list[Observation]:
         """What panoramas (T, H, W, 3) show, each by itself."""
-        views = self.views(panoramas)
+        views = self.views(self.masked(panoramas))
         return [self.observed(view, self.located(view, Conditions())) for view in views]
+
+    def masked(self, panoramas: Image) -> Image:
+        """Panoramas (T, H, W, 3) without what hides the view; unchanged those that are masked."""
+        require_size(panoramas, self.network.architecture)
+        if self.repeated is None:
+            return panoramas
+        pixels = panoramas.reshape(len(panoramas), -1, 3)
+        return pixels[:, self.repeated.ravel()].reshape(panoramas.shape)
 
     def views(self, panoramas: Image) -> list[View]:
         """Textures of panoramas (T, H, W, 3), leveled by keyframes."""
@@ -140,6 +154,12 @@ class PlaceModel:
         arrays = {**self._arrays(), 'header': np.array(json.dumps(self._header(), sort_keys=True))}
         write_arrays(path, arrays)
 
+    @property
+    def origin(self) -> Origin | None:
+        """Latitude and longitude, degrees, of x = y = 0, if a receiver measured points."""
+        origin = self.quality.get('origin')
+        return (float(origin[0]), float(origin[1])) if origin else None
+
     @classmethod
     def load(cls, path: Path | str) -> PlaceModel:
         """Read a model. Raises ModelError when it is missing, damaged or of another version."""
@@ -185,6 +205,7 @@ class PlaceModel:
             'quality': self.quality,
             'error_correlation': dataclasses.asdict(self.error_correlation),
             'rig': self.rig.to_mapping(),
+            'mount_rpy': self.mount_rpy,
         }
 
     def _arrays(self) -> Arrays:
@@ -194,8 +215,11 @@ class PlaceModel:
             arrays |= _prefixed(f'network/{depth}/', {**parts, 'delta': self.network.deltas[depth]})
         arrays |= _prefixed('metric/', self.metric.to_arrays())
         arrays |= _prefixed('keyframes/', self.keyframes.to_arrays())
+        arrays |= _prefixed('ground/', self.ground.to_arrays())
         if self.turned is not None:
             arrays |= _prefixed('turned/', self.turned.to_arrays())
+        if self.repeated is not None:
+            arrays['repeated'] = self.repeated
         return arrays
 
     @classmethod
@@ -207,10 +231,13 @@ class PlaceModel:
             MetricMap.from_arrays(_under(arrays, 'metric/')),
             panorama,
             Keyframes.from_arrays(_under(arrays, 'keyframes/'), panorama.sphere),
+            DrivenGround.from_arrays(_under(arrays, 'ground/')),
             TurnedMaps.from_arrays(turned) if turned else None,
             header['quality'],
             ErrorCorrelation(**header['error_correlation']),
             Rig.from_mapping(header['rig']),
+            arrays.get('repeated'),
+            tuple(header.get('mount_rpy', ())),
         )
 
 

@@ -21,11 +21,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sfa_localization.bags.drives import image_folder, read_drives
+from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.fusion.motion import TURN_RADIUS_M
+from sfa_localization.metric.driven_ground import DrivenGround
 from sfa_localization.metric.drives import Maps, compare_with_map, learn_map, rig_of, with_points
 from sfa_localization.metric.keyframe_map import learn_keyframes
 from sfa_localization.metric.learning import MetricResult, learn_metric, with_turned
@@ -129,16 +133,23 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     quality: dict[str, Any] = {'features_used': first.map.features, 'turned': turned is not None}
     quality |= {'delta': network.deltas[-1].tolist(), 'rank': [*map(list, network.ranks)]}
     quality |= segments.points.quality(result.points) if segments.points else {}
+    quality |= {'origin': origin} if (origin := given.runs[-1].origin) else {}
     quality |= {'segments': len(segments), **images.quality, **result.quality}
     quality |= keyframe_map.quality
+    unwrapper = Unwrapper(given.recipe.camera, given.panorama)
+    rig = rig_of(given.drives, segments)
+    drive = np.concatenate([np.full(len(segment.images), segment.run) for segment in segments])
     model = PlaceModel(
         network,
         result.map,
         given.panorama,
         keyframe_map.keyframes,
+        DrivenGround.of(rig.centers(result.poses), drive, result.forecast.local),
         turned,
         quality,
         keyframe_map.correlation,
-        rig_of(given.drives, segments),
+        rig,
+        repeated=unwrapper.repeated,
+        mount_rpy=unwrapper.mount_rpy,
     )
     return Trained(model, given.runs, images.slow, segments, result)

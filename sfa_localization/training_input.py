@@ -10,15 +10,20 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sfa_localization.bags.drives import ReadingRecipe
+from sfa_localization.camera import body
 from sfa_localization.camera.kinds import require_single_view
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings, turns_and_textures
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.progress import announce, progress_bar
 from sfa_localization.data.run import Run
+from sfa_localization.data.sphere import Sphere
+from sfa_localization.data.statistics import evenly
 from sfa_localization.fusion.camera_clock import camera_clock
+from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.keyframes.closures import Textures, find_closures, views_of
 from sfa_localization.keyframes.leveling import leveled_runs
+from sfa_localization.keyframes.texture import channels
 from sfa_localization.metric.drives import Drive, Drives
 from sfa_localization.metric.motion_check import MotionCheck, check_drives
 from sfa_localization.metric.mount import Mount
@@ -68,6 +73,7 @@ class TrainingInput:
             runs = leveled_runs(runs, recipe.panorama.sphere, bar.update)
         with progress_bar(titled(2, 'find loop closures'), total, visible=progress) as bar:
             views = views_of(runs, bar.update)
+        _warn_of_bodies(runs, views, recipe.panorama.sphere)
         closures = find_closures(views, recipe.panorama.clockwise)
         runs = same_scale(runs, closures)
         points = points_of(runs, recipe.metric.points)
@@ -151,13 +157,25 @@ def compared(
         require_single_view(runs)
     images = [turns_and_textures(run.panoramas, recipe.panorama.clockwise) for run in runs]
     turns, textures = zip(*images, strict=True)
-    corrected, checks = check_drives(runs, turns, force, textures)
+    commands = [OpenLoop.of(run.odometry.twists).repeats for run in runs]
+    corrected, checks = check_drives(runs, turns, force, textures, commands)
     if recipe.segments.yaw_source == 'gyro':  # on request also a gyroscope that was rejected
         corrected = tuple(
             replace(run, yaw_rate=run.yaw_rate or recorded.yaw_rate)
             for run, recorded in zip(corrected, runs, strict=True)
         )
     return corrected, checks
+
+
+def _warn_of_bodies(runs: Sequence[Run], views: Textures, sphere: Sphere) -> None:
+    """Warn of what hides the view in all images of a drive."""
+    rows = channels(views.textures.shape[1])[0]
+    for number, run in enumerate(runs):
+        textures, stamps = views.textures[views.run == number], run.panoramas.stamps_ns
+        chosen = evenly(len(stamps), body.IMAGES)
+        headings = run.odometry.trajectory.at(stamps[chosen])[:, 2]
+        for text in body.sentences(body.bodies(textures[chosen][:, rows], headings, sphere)):
+            logger.warning('%s: %s', run.name, text)
 
 
 def drive_of(run: Run) -> Drive:

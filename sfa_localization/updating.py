@@ -26,7 +26,7 @@ from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.progress import progress_over
-from sfa_localization.data.run import Panoramas, Run
+from sfa_localization.data.run import PanoramaArray, Panoramas, Run
 from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
 from sfa_localization.fusion.camera_clock import camera_clock
@@ -103,7 +103,7 @@ def update(
 
     Raises BagError, DataError or ModelError; then no model is written.
     """
-    recipe, added = as_live(recipe or ReadingRecipe(), model.panorama), []
+    recipe, added = as_live(recipe or ReadingRecipe(), model.panorama, model.mount_rpy), []
     cache = image_folder(Path(output))
     for bag in bags:
         run = read_drive(bag, cache, recipe, progress, strict=strict)
@@ -149,8 +149,8 @@ def new_views(
     chosen = np.flatnonzero(np.array(localised) & certain & novel & agree)
     chosen = chosen[_spread(poses[chosen])]
     tilts = np.reshape([image.tilt for image in observations], (-1, 2))
-    leveled = LeveledPanoramas(run.panoramas, tilts, model.keyframes.sphere)
-    return Additions(_textures(leveled, chosen), model.rig.camera(poses[chosen]))
+    textures = _textures(model, run.panoramas, chosen, tilts[chosen])
+    return Additions(textures, model.rig.camera(poses[chosen]))
 
 
 def usual_explained(model: PlaceModel) -> float:
@@ -196,12 +196,16 @@ def _spread(poses: Array) -> NDArray[np.int64]:
         cell_m *= _CELL_GROWTH
 
 
-def _textures(images: Panoramas, chosen: NDArray[np.int64]) -> NDArray[np.int8]:
-    """Textures (M, rows, columns) of the chosen images (M,)."""
+def _textures(
+    model: PlaceModel, images: Panoramas, chosen: NDArray[np.int64], tilts: Array
+) -> NDArray[np.int8]:
+    """Textures (M, rows, columns) of the chosen images (M,), leveled by their tilts (M, 2)."""
     if not len(chosen):
         return np.zeros((0, 0, 0), np.int8)
-    read = (images.read(i, i + 1)[0] for i in chosen.tolist())
-    return quantized(np.stack([texture(image) for image in read]))
+    read = np.concatenate([model.masked(images.read(i, i + 1)) for i in chosen.tolist()])
+    masked = PanoramaArray(images.stamps_ns[chosen], read)
+    leveled = LeveledPanoramas(masked, tilts, model.keyframes.sphere)
+    return quantized(np.stack([texture(image) for image in leveled.read(0, len(chosen))]))
 
 
 def extended(model: PlaceModel, new: Additions, name: str) -> PlaceModel:

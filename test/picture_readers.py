@@ -16,9 +16,12 @@ from sfa_localization.data.rig import Rig
 from sfa_localization.keyframes.location import Location
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE, Observation
 from sfa_localization.keyframes.regression import Fit
+from sfa_localization.metric.driven_ground import DrivenGround
 
 SIZE = PanoramaConfig(width=64, height=16)
 STEP_M = 0.05
+CORNER = np.array([[0.0, 1.0], [0.5, 1.0], [0.5, 1.5]])
+DROVE = DrivenGround.of(CORNER, np.zeros(3), np.array([0.0, 0.15, 0.6]))
 UNLIKE_DEFAULT = ErrorCorrelation(0.5, 2.0)
 
 
@@ -50,8 +53,14 @@ class PictureReader:
 
     panorama: PanoramaConfig = SIZE
     heading: bool = True
+    origin: tuple[float, float] | None = None
     error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
     rig: Rig = dataclasses.field(default_factory=Rig)
+    ground: DrivenGround = dataclasses.field(default_factory=lambda: DROVE)
+    mount_rpy: tuple[float, ...] = ()
+
+    def masked(self, images):
+        return images
 
     def views(self, images):
         return images

@@ -33,6 +33,7 @@ BASE = {
     'calibrate': '{data}/mirror.png',
     'filter': '{data}/odom.csv {data}/positions.csv --output {out}/poses.tum',
     'tune': '{data}/test --model {data}/model.npz --output {out}/out.yaml',
+    'map': '{data}/model.npz --output {out}/garden.yaml',
     'config': '',
     'demo': '--out {out}/demo',
     # For these options something else.
@@ -64,6 +65,7 @@ CASES = {
         --align {data}/bag; --config {data}/start.yaml; --smooth; --report {out}/report
         --json {out}/figures.json; --image-topic /nothing => /nothing; --odom-topic /ground_truth
         --imu-topic /nothing => /nothing; --ground-truth-topic /odom""",
+    'map': '--output {out}/other.yaml; --width 0.5; --cell 0.1',
     'play': '--loop; --clock; --topics /odom; --rate 500; --wait 0.01',
     'inspect': """
         --json {out}/found.json; --report {out}/report; --strict => read without --strict
@@ -210,6 +212,12 @@ def test_every_option_has_a_case_and_every_case_an_option():
     }
     listed = {(name, words.split()[0]) for name in CASES for words, _ in cases(name)}
     assert listed == options, 'a new option needs a case in CASES'
+
+
+def test_a_model_that_is_replaced_is_named(data, tmp_path):
+    shutil.copy(data / 'model.npz', tmp_path / 'model.npz')
+    made = run('train', BASE['train'], tmp_path, data=data)
+    assert 'model.npz: written, the model that was there is replaced' in made.text
 
 
 @pytest.mark.parametrize('name', cli.COMMANDS)

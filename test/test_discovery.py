@@ -79,8 +79,9 @@ OTHER_NAME = ['--ros-args', '-r', 'ekf/odometry:=/fused', '-r', '__ns:=/robot1']
 
 @pytest.mark.parametrize(('kind', 'other', 'topics', 'arguments'), [
     # The driver is in the namespace, or its topic alone, because a bridge has none.
-    (EkfNode, {'namespace': '/robot1'}, ['/robot1/ekf/odometry', '/robot1/wheels'], 'odom:=NAME'),
-    (EkfNode, {'cli_args': OTHER_NAME}, ['/fused'], 'odom:=NAME'),
+    (EkfNode, {'namespace': '/robot1'}, ['/robot1/wheels'], 'odom:=NAME'),
+    (EkfNode, {'namespace': '/robot1'}, ['/robot1/ekf/odometry'], ''),
+    (EkfNode, {'cli_args': OTHER_NAME}, ['/fused'], ''),
     (OmnicamNode, {'namespace': '/robot1'}, ['/robot1/panorama'], IMAGES),
     # Played from a bag of another namespace.
     (OmnicamNode, None, ['/robot1/panorama'], IMAGES),
@@ -96,7 +97,11 @@ def test_the_output_of_another_localizer_is_no_sensor(bench, kind, other, topics
         announce(bench, node, message, *topics)
     assert not takes_another(node, topic)
     hint = node.discovery.hint
+    if not arguments:
+        assert hint == '', 'nor is it offered as one'
+        return
     assert all(name in hint for name in topics) and hint.endswith(f': {arguments}')
+    assert 'ekf/odometry' not in hint
 
 
 def test_without_images_the_diagnostics_name_those_that_there_are(bench, monkeypatch):

@@ -155,7 +155,7 @@ def test_the_table_of_topics_is_that_of_the_nodes(bench, monkeypatch):
     rows = TOPIC_ROW.findall(PAGES['config/README.md'])
     published = {row[:3] for row in rows if '_node' in row[2] and row[0] != 'tf'}
     read = {(topic, kind, node) for topic, kind, _, node in rows if '_node' in node}
-    raw = {row for row in read if not row[0].endswith('/compressed')}
+    raw = {row for row in read if not row[0].endswith(('/compressed', '/ffmpeg', '/foxglove'))}
     assert topics_of('publishers') == published
     assert until(lambda: topics_of('subscriptions') == raw)
 
@@ -198,8 +198,34 @@ def test_robot_localization_finds_a_robot_that_starts_anywhere(launch):
     assert [*launch(**given(line))] == ['omnicam_node', 'sfa_node'], 'no second filter'
 
 
+_COSTMAP = ('global_frame', 'robot_base_frame', 'rolling_window', 'width', 'height', 'resolution',
+            'track_unknown_space', 'plugins', 'static_layer.plugin', 'static_layer.map_topic',
+            'static_layer.map_subscribe_transient_local')  # fmt: skip
+NAV2_PARAMETERS = {
+    f'{node}.ros__parameters.{name}'
+    for node, names in {
+        'bt_navigator': ('global_frame', 'robot_base_frame', 'odom_topic'),
+        'collision_monitor': ('base_frame_id', 'odom_frame_id'),
+        'controller_server': ('odom_topic',),
+        'global_costmap.global_costmap': _COSTMAP,
+        'local_costmap.local_costmap': _COSTMAP,
+        'planner_server': ('planner_plugins', 'GridBased.plugin', 'GridBased.allow_unknown'),
+        'lifecycle_manager_localization': ('autostart', 'bond_timeout', 'node_names'),
+    }.items()
+    for name in names
+}
+"""Names in the configuration guide of Nav2 for Jazzy, of the parameters that nav2.yaml sets."""
+
+
+def leaves(settings, path=()):
+    """The names of all parameters in a tree, with those of their nodes."""
+    for name, value in settings.items():
+        here = (*path, name)
+        yield from leaves(value, here) if isinstance(value, dict) else ['.'.join(here)]
+
+
 def test_nav2_uses_our_frames():
-    """And plans in a rolling window whose layers wait for no map, where its default is another."""
+    """And plans on the ground that was driven, which it takes from the latched topic."""
     settings = yaml.safe_load((ROOT / 'config/nav2.yaml').read_text('utf-8'))
     navigator, monitor, controller = (
         settings[name]['ros__parameters']
@@ -210,9 +236,16 @@ def test_nav2_uses_our_frames():
     assert navigator['robot_base_frame'] == monitor['base_frame_id'] == frames.base_frame
     assert monitor['odom_frame_id'] == frames.odom_frame
     assert navigator['odom_topic'] == controller['odom_topic'] == 'odom', 'not of another robot'
-    window = settings['global_costmap']['global_costmap']['ros__parameters']
-    assert window['rolling_window'] is True
-    assert window['plugins'] == ['obstacle_layer', 'inflation_layer']
+    layer = settings['global_costmap']['global_costmap']['ros__parameters']['static_layer']
+    assert layer['map_topic'].lstrip('/') in topics() and layer['map_subscribe_transient_local']
+    manager = settings['lifecycle_manager_localization']['ros__parameters']
+    assert manager['node_names'] == list(NODES) and manager['bond_timeout'] == 0.0
+    assert set(leaves(settings)) <= NAV2_PARAMETERS
+
+
+def test_an_aggregator_shows_all_nodes():
+    settings = yaml.safe_load((ROOT / 'config/analyzers.yaml').read_text('utf-8'))
+    assert settings['/**']['ros__parameters']['localization']['contains'] == list(NODES)
 
 
 class Recorded:
@@ -270,11 +303,16 @@ def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
     assert [*launched] == list(NODES) and [*without] == ['sfa_node', 'ekf_node']
     for node in [*launched.values(), *without.values()]:
         assert set(node['parameters'][1]) <= parameters()
+        assert 'autostart' not in node['parameters'][1]
         sources = {source for source, _ in node['remappings']}
         assert sources <= topics() | {'image_raw', 'odom', '/tf'}
     assert ('/tf', 'tf') in launched['ekf_node']['remappings']
     assert ('/tf', '/tf') in launch(tf='/tf')['ekf_node']['remappings']
     assert [*launch(ekf='false')] == ['omnicam_node', 'sfa_node']
+    assert [*launch(rviz='true')] == [*NODES, 'rviz2']
+    for node in launch(autostart='false', params_file=ROOT / 'config/nav2.yaml').values():
+        file, chosen = node['parameters']
+        assert file == ROOT / 'config/nav2.yaml' and chosen['autostart'] is False
     assert without['sfa_node']['parameters'][1]['image_transport'] == 'compressed'
     panorama = dict(without['sfa_node']['remappings'])['panorama']
     odometry = dict(without['ekf_node']['remappings'])['odom']

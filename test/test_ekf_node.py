@@ -19,11 +19,12 @@ from builtin_interfaces.msg import Time as Stamp
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, TransformStamped
 from nav_msgs.msg import Odometry, Path
+from nav_msgs.srv import SetMap
 from rclpy.parameter import Parameter
 from ros_bench import SEEN, AsText, message_of, play, until
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Empty, SetBool, Trigger
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import compose
@@ -162,6 +163,36 @@ def test_initialpose_and_set_pose_set_the_pose(bench):
     assert abs(node.filter.state.pose[0] - (-3.0 - drive.poses[-1, 0])) < 0.1
 
 
+def test_the_services_of_nav2_amcl_set_and_forget_the_pose(bench, monkeypatch):
+    """SetMap, whose request also holds a pose, stands in for nav2_msgs, which no wheel has."""
+    given = property(attrgetter('initial_pose'))
+    monkeypatch.setattr(SetMap.Request, 'pose', given, raising=False)
+    monkeypatch.setattr(ekf_node, 'SetInitialPose', SetMap)
+    drive, node = FilterDrive(seconds=2, **NOISY), bench.run(EkfNode, initial_pose=AT_ORIGIN)
+    everywhere = Empty, 'reinitialize_global_localization', Empty.Request()
+    name, now_ns = 'set_initial_pose', START_NS + 580_000_000
+
+    def set_pose(frame, spread):
+        message = convert.to_pose_with_covariance([7.0, 1.0, 0.0], spread, now_ns, frame)
+        return bench.call(SetMap, name, SetMap.Request(initial_pose=message))
+
+    play(bench, node, drive, part(drive, end=0.6))
+    for frame, spread, why in (('odom', 1.0, "frame is 'odom'"), ('map', -1.0, 'negative var')):
+        set_pose(frame, spread * np.eye(3))
+        assert any(why in reason for reason in node.monitors[name].refused)
+    assert abs(node.filter.state.pose[0]) < 1.0
+    set_pose('map', 0.01 * np.eye(3))
+    assert node.filter.state.pose[0] > 6.5 and node.monitors[name].used == 1
+    bench.call(*everywhere)
+    assert node.filter.state is None and node.status().level.name == 'UNINITIALISED'
+    play(bench, node, drive, part(drive, 0.6))
+    assert near(node.filter.state.pose, drive.poses[-1], 0.4)
+    bench.do(node.trigger_deactivate)
+    bench.call(*everywhere)
+    assert node.filter.state is not None
+    assert node.monitors[everywhere[1]].refused == {'this node is not active': 1}
+
+
 def test_reset_and_pause(bench):
     drive = FilterDrive(seconds=5, **NOISY)
     node = bench.run(EkfNode)
@@ -182,6 +213,33 @@ def test_reset_and_pause(bench):
     assert answer.success and answer.message == 'UNINITIALISED'
     play(bench, node, drive, part(drive, 1.0))
     assert until(lambda: node.status().level.name == 'LOCALISED')
+
+
+def test_two_publishers_of_odometry_and_one_without_poses_are_named(bench):
+    drive = FilterDrive(seconds=1.2, **NOISY)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
+    odometries, logged = bench.listen(Odometry, 'ekf/odometry'), mock.Mock()
+    with mock.patch.object(node, 'get_logger', return_value=logged):
+        second = bench.node.create_publisher(Odometry, 'odom', 1000)
+        assert until(lambda: node.count_publishers('/odom') == 1)
+        for number, event in enumerate(part(drive, end=1.0, kinds=[0])):
+            topic, message = message_of(drive, *event[1:])
+            message.pose.pose.position.x += 3.0 * (number % 2)
+            bench.publish_until(topic, message, lambda n=number: len(odometries) > n)
+        assert until(lambda: node.count_publishers('/odom') == 2)
+        text = 'two publishers on /odom: stop one, or take another topic by odom:='
+        assert text in node.health()[1] and node.status().level.name == 'DEGRADED'
+        assert text in str(logged.warning.mock_calls)
+        bench.do(bench.node.destroy_publisher, second)
+        assert until(lambda: text not in node.health()[1])
+        transforms = bench.listen(TransformStamped, 'ekf/map_to_odom')
+        for event in part(drive, 1.0, kinds=[0]):
+            number += 1
+            topic, message = message_of(drive, *event[1:])
+            message.pose.pose.orientation = Quaternion(w=0.0)
+            bench.publish_until(topic, message, lambda n=number: len(odometries) > n)
+        assert 'its pose is not filled' in str(logged.warning.mock_calls)
+    assert near(pose_of(odometries[-1]), drive.poses[-1], 0.2) and transforms == []
 
 
 TWIST, TURNED, PLACED = 'twist.twist', 'pose.pose.orientation', 'pose.pose.position'
@@ -351,6 +409,10 @@ def test_after_a_restart_it_looks_where_it_was_first(bench, tmp_path):
     play(bench, again, elsewhere)
     assert until(lambda: len(heard) == len(elsewhere.pictures))
     assert np.hypot(*(pose_of(heard[-1]) - elsewhere.poses[elsewhere.pictures[-1]])[:2]) < 0.5
+    (tmp_path / 'file').touch()
+    node = bench.run(EkfNode, pose_file=str(tmp_path / 'file' / 'pose.json'))
+    assert any('cannot be written' in why for why in node.monitors['pose_file'].refused), 'at start'
+    bench.end(node)
     pose_file.write_text('{}')
     for given in ({'initial_pose': AT_ORIGIN}, {}):
         node = bench.run(EkfNode, pose_file=str(pose_file), **given)

@@ -85,7 +85,7 @@ def test_headers_and_separators_of_all_kinds_read_alike_and_nanoseconds_survive(
         {'sep': ';', 'head': 'stamp_s;v_mps;omega_radps'},
     ):  # fmt: skip
         table = read_table(write_logs(tmp_path, drive, **how)[0], ODOMETRY)
-        assert np.array_equal(table.stamps_ns, drive.stamps_ns) and table.skipped == 0
+        assert np.array_equal(table.stamps_ns, drive.stamps_ns) and table.skipped == ()
         assert np.allclose(table.values[:, :2], drive.read)
     for stamp, name in (('1700000000123456789', 'stamp_ns'), ('1700000000.123456789', 'stamp_s')):
         path.write_text(f'note,y_m,x_m,{name},var_y\nhello,2,1,{stamp},\n')
@@ -103,7 +103,7 @@ def test_disorder_is_sorted_and_bad_rows_are_counted(tmp_path):
            '1700000000000000000,1,1', '1e999999,1,1']  # fmt: skip
     odometry.write_text('\n'.join([head, *rows[:50], *bad, *rows[50:], rows[0], '', '']))
     table = read_table(odometry, ODOMETRY)
-    assert len(table.stamps_ns) == len(drive.stamps_ns) + 1 and table.skipped == len(bad)
+    assert len(table.stamps_ns) == len(drive.stamps_ns) + 1 and table.skipped == (*range(52, 60),)
     assert np.all(np.diff(table.stamps_ns) >= 0)
     done = run_filter(table, read_table(positions, POSITIONS), STARTED)
     assert done.counts['odometry: duplicate stamp'] == 1

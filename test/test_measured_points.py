@@ -50,7 +50,7 @@ WHEELS = 1.02
 
 def points(places):
     """Points at places (K,), known to STD."""
-    return Points.of([(f'point {k}', k, complex(at), STD) for k, at in enumerate(places)])
+    return Points.of([(f'point {k}', k, complex(at), STD, 0j) for k, at in enumerate(places)])
 
 
 def settled(measured, places, std=0.02):
@@ -129,12 +129,30 @@ def measured_at(rows, wrong=None):
     places = places + STD * (rng.standard_normal(len(rows)) + 1j * rng.standard_normal(len(rows)))
     places[[] if wrong is None else [wrong]] += 2.0
     stamps = run.stamps_ns[rows].tolist()
-    return Points.of([(f'point {k}', stamps[k], at, STD) for k, at in enumerate(places.tolist())])
+    return Points.of(
+        [(f'point {k}', stamps[k], at, STD, 0j) for k, at in enumerate(places.tolist())]
+    )
 
 
 def drive_of(run, odometry):
     images = PanoramaArray(run.stamps_ns, np.zeros((len(run.stamps_ns), 1, 1, 3), np.uint8))
     return Drive(Run('drive', images, odometry), run.poses[:, 2].tolist())
+
+
+def test_points_of_an_antenna_are_placed_beside_base_link():
+    """At stamps between images, in turns too."""
+    odometry, run, _ = world()
+    antenna = -0.4 + 0.3j
+    stamps = run.stamps_ns[5:-5:40] + 60_000_000
+    poses = odometry.trajectory.at(stamps)
+    places = (poses[:, 0] + 1j * poses[:, 1] + antenna * np.exp(1j * poses[:, 2])).tolist()
+    rows = zip(stamps.tolist(), places, strict=True)
+    given = Points.of([('fix', *row, STD, antenna) for row in rows])
+    drives = [(odometry, run.stamps_ns)]
+    measured = MeasuredPoints.of(given, drives, np.arange(len(run.poses)))
+    near = odometry.trajectory.at(run.stamps_ns[measured.images])
+    beside = near[:, 0] + 1j * near[:, 1] + measured.offset * np.exp(1j * near[:, 2])
+    np.testing.assert_allclose(beside, places, atol=1e-9)
 
 
 @functools.cache
@@ -218,7 +236,7 @@ def test_points_bend_a_route_straight():
     item = drive_of(run, run.odometry)
     rows, config = np.linspace(5, len(run.poses) - 6, 8).astype(int), SegmentConfig()
     given = Points.of([
-        (str(k), int(run.stamps_ns[row]), complex(*run.poses[row, :2]), STD)
+        (str(k), int(run.stamps_ns[row]), complex(*run.poses[row, :2]), STD, 0j)
         for k, row in enumerate(rows.tolist())
     ])  # fmt: skip
     missed = []
@@ -247,7 +265,7 @@ def test_stops_are_named_by_their_number(tmp_path):
         np.array([[0.0, 3.0], [8.0 + 1 / 0.6, 11.0 + 1 / 0.6]]), abs=0.1
     )
     file.write_text('stamp_s,x_m,y_m,std_m\n# a mark\nstop, 2, 4.0, 1.5\n12.5, 3, -1, 0.05\n')
-    read = read_points(file, odometry)
+    read = read_points(file, [odometry])
     assert read.names == ('stop 2', 'point of 12.5 s')
     assert read.stamps_ns == pytest.approx([stops(odometry)[1].mean(), 12_500_000_000], abs=1)
     assert read.places.tolist() == [4 + 1.5j, 3 - 1j] and read.std.tolist() == [0.02, 0.05]
@@ -257,19 +275,20 @@ def test_stops_are_named_by_their_number(tmp_path):
     ('stop, 3, 1, 1', 'stands 2 times'), ('stop, 0, 1, 1', 'no stop 0'),
     ('12.5, 1', 'is no point'), ('12.5, one, 2', 'is no point'), ('12.5, 1, 2, 0', 'is no point'),
     ('12.5, nan, 2', 'is no point'), ('# nothing', 'holds no points'),
+    ('stop, 3, 1, 1\nstop, 1, O, 1', "line 2: 'stop, 1, O, 1' is no point"),
 ])  # fmt: skip
 def test_a_line_that_is_no_point_is_an_error_that_names_it(tmp_path, line, said):
     file = tmp_path / 'points.csv'
     file.write_text(line)
     with pytest.raises(DataError, match=said):
-        read_points(file, standing())
+        read_points(file, [standing()])
 
 
 def test_a_point_of_no_drive_is_an_error_before_anything_is_learned(tmp_path):
     file = tmp_path / 'points.csv'
     file.write_text('Stop, 2, 4.0, 1.5\n12.5, 3, -1\n')
     run = drive(np.vstack([stand(3), straight(4), stand(3), straight(1)]))
-    with pytest.raises(DataError, match=r'12\.5 s: outside of the drives'):
+    with pytest.raises(DataError, match=r'line 2: point of 12\.5 s: outside of the drives'):
         points_of([run], str(file))
 
 

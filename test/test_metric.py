@@ -160,8 +160,8 @@ def test_the_map_is_the_odometry_frame_at_the_start_and_a_start_pose_moves_it():
     assert np.allclose(moved.poses[:, :2], frame.apply(result.poses[:, :2]))
     *worst, error = result.forecast.worst
     assert moved.forecast.worst == pytest.approx([*frame.apply(np.array([worst]))[0], error])
-    for pose in ((1.0,), (1.0, 2.0, 3.0, 4.0)):
-        with pytest.raises(ConfigError, match='x, y, yaw'):
+    for pose, why in (((1.0,), 'give x'), ((1.0,) * 4, 'give x'), ((1.0, 2.0, 90.0), 'radians')):
+        with pytest.raises(ConfigError, match=f'start_pose: .*{why}'):
             MetricConfig(start_pose=pose)
 
 

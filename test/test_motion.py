@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The CTRV motion: against finite differences and hand-made arcs."""
 
+import functools
 import math
 
 import numpy as np
@@ -37,7 +38,12 @@ def differences(function, mean, step=1e-6):
 def test_jacobians_are_the_derivatives_and_noise_is_symmetric_and_positive(v, omega):
     mean, twist = random_mean(np.random.default_rng(1)), Twist(v, omega, 1e-4, 1e-4)
     mean[V], mean[OMEGA] = v, omega
-    for step in (motion.drive, motion.coast, motion.halt):
+    changes = np.array([0.2, 0.1])
+    for step in (
+        motion.drive,
+        functools.partial(motion.coast, changes=changes),
+        functools.partial(motion.halt, changes=changes),
+    ):
         _, jacobian, noise = step(mean, twist, 0.3, NOISE)
         assert np.allclose(noise, noise.T) and np.linalg.eigvalsh(noise)[0] > -1e-15
         # The shared error fades with the distance; that derivative is second order and left out.

@@ -167,6 +167,58 @@ def test_a_gyroscope_is_corrected(sample, factor, late_s, texts):
     assert np.abs(run.yaw_rate.omega - expected)[60:-60].max() < 0.05
 
 
+def held(rate: np.ndarray, rng) -> np.ndarray:
+    """Rates of which one is held for two seconds, after six that are right."""
+    rows = np.arange(len(rate))
+    return rate[np.where(rows % 200 < 150, rows, rows - rows % 200 + 150)]
+
+
+RATES = {
+    'zeros': (lambda w, rng: np.where(rng.random(len(w)) < 0.2, 0.0, w), (140, 160), True),
+    'spikes': (lambda w, rng: np.where(rng.random(len(w)) < 0.01, 30.0, w), (5, 12), True),
+    'small spikes': (lambda w, rng: np.where(rng.random(len(w)) < 0.01, w - 5.0, w), (5, 12), True),
+    'held': (held, (100, 160), True),
+    'noise': (lambda w, rng: w + rng.normal(0.0, 0.02, len(w)), (0, 0), True),
+    'bias': (lambda w, rng: w + 0.02, (0, 0), True),
+    'half zeros': (lambda w, rng: np.where(rng.random(len(w)) < 0.5, 0.0, w), (0, 0), False),
+    'another range': (lambda w, rng: 0.8 * w, (0, 0), False),
+}
+
+
+@pytest.mark.parametrize('name', RATES)
+def test_rates_that_wheels_and_images_contradict_are_left_out(sample, name):
+    change, (least, most), stays = RATES[name]
+    right = sample.yaw_rate
+    recorded = replace(right, omega=change(right.omega, np.random.default_rng(0)))
+    run, check = checked(replace(sample, yaw_rate=recorded))
+    text = '; '.join(check.corrected)
+    assert ('messages contradict wheels and images' in text) == bool(most)
+    assert ('left out: the wheels agree better with the images' in text) != stays
+    if not stays:
+        assert run.yaw_rate is None
+        return
+    kept = run.yaw_rate
+    assert least <= len(right.omega) - len(kept.omega) <= most
+    of_kept = np.interp(kept.stamps_ns, right.stamps_ns, right.omega)
+    assert np.median(np.abs(kept.omega - of_kept)) < 0.03
+    assert np.abs(kept.omega - of_kept).max() < (0.7 if most else 0.1)
+
+
+def skidding(run: Run, where) -> Run:
+    """Whose wheels turn by 0.6 rad/s more there."""
+    odometry = run.odometry
+    twists = odometry.twists + np.outer(where(np.arange(len(odometry.twists))), [0.0, 0.6])
+    poses = integrate(odometry.stamps_ns, twists)
+    return replace(run, odometry=replace(odometry, twists=twists, poses=poses))
+
+
+@pytest.mark.parametrize('where', [lambda i: i // 25 % 5 == 0, lambda i: (i > 200) & (i < 240)])
+def test_wheels_that_skid_now_and_then_do_not_condemn_the_gyroscope(sample, where):
+    run, check = checked(skidding(sample, where))
+    assert np.array_equal(run.yaw_rate.omega, sample.yaw_rate.omega)
+    assert not any('gyroscope' in text for text in check.corrected)
+
+
 def test_a_gyroscope_of_another_motion_or_epoch_is_left_out(sample):
     noise = gyro(sample, np.random.default_rng(0).normal(size=len(sample.yaw_rate.omega)))
     for recorded, text in ((noise, 'left out'), (gyro(sample, late_s=1e6), 'another clock')):
@@ -188,6 +240,11 @@ def test_clocks_that_differ_are_corrected_or_reported(sample, tmp_path, late_s, 
     assert any('synchronize' in lack for lack in report.lacks) == (abs(late_s) > 0.5)
 
 
+def shifted(stamps_ns, rate):
+    """Stamps of a clock that gains `rate` s in each second."""
+    return stamps_ns + np.round((stamps_ns - stamps_ns[0]) * rate).astype(np.int64)
+
+
 # The comparison itself, of drives whose motion is known.
 
 DRIVES = {
@@ -205,6 +262,63 @@ def test_a_map_is_compared_with_its_odometry_over_ten_meters():
     collapsed = compare_map(run.odometry, run.stamps_ns, poses * [0.4, 0.4, 1.0])
     assert collapsed.differs('scale') and collapsed.scale == pytest.approx(0.4, abs=0.04)
     assert compare_map(run.odometry, run.stamps_ns, poses[::-1]).differs('alike')
+
+
+@pytest.mark.parametrize('rate', [0.005, -0.003, 0.0])
+@pytest.mark.parametrize(('late', 'said'), [
+    ('images', 'images: their'), ('gyroscope', 'gyroscope: its'), ('both', 'odometry: its')
+])  # fmt: skip
+def test_a_clock_that_drifts_is_followed_along_the_drive(late, said, rate):
+    run = drive(*DRIVES['straight legs'][:1], yaw_noise=0.02, seed=1)
+    images, gyro = run.stamps_ns, run.gyro
+    if late != 'gyroscope':
+        images = shifted(images, rate)
+    if late != 'images':
+        gyro = replace(gyro, stamps_ns=shifted(gyro.stamps_ns, rate))
+    panoramas = PanoramaArray(images, np.zeros((len(images), 1, 1, 3), np.uint8))
+    recorded = Run('run', panoramas, run.odometry, gyro)
+    (corrected,), (check,) = check_drives([recorded], [run.poses[:, 2]])
+    fast = (rate > 0) == (late != 'both')
+    text = f'{said} clock runs {abs(rate):.2%} {"fast" if fast else "slow"}: taken into account'
+    assert check.wrong == [] and check.corrected == [text.replace('%', ' %')] * (rate != 0)
+    if rate:
+        assert np.abs(corrected.panoramas.stamps_ns - run.stamps_ns).max() < 2e7
+
+
+FOLLOWING = {
+    'with a lag of 0.5 s': (0.5, np.inf, 0.0),
+    'with a lag of 2 s': (2.0, np.inf, 0.0),
+    'at 0.2 rad/s at most': (0.0, 0.2, 0.0),
+    'beyond 23 degrees only': (0.0, np.inf, 0.4),
+}
+
+
+@pytest.mark.parametrize('how', FOLLOWING)
+def test_images_that_follow_the_turns_are_refused_and_no_delay_is(how):
+    run = drive(*DRIVES['straight legs'][:1], yaw_noise=0.02, seed=1)
+    lag_s, fastest, ignored = FOLLOWING[how]
+    yaw, shown = np.unwrap(run.odometry.poses[:, 2]), [0.0]
+    for now in yaw[1:]:
+        behind = now - shown[-1]
+        pulled = (behind - np.clip(behind, -ignored, ignored)) * (0.02 / lag_s if lag_s else 1)
+        shown.append(shown[-1] + np.clip(pulled, -0.02 * fastest, 0.02 * fastest))
+    seen = np.interp(run.stamps_ns, run.odometry.stamps_ns, shown)
+    for gyro in (run.gyro, None):
+        check = check_motion(run.odometry, (run.stamps_ns, seen), gyro)
+        assert len(check.wrong) == 1 and f"follow the robot's turns {how}: switch" in check.wrong[0]
+    # Odometry that repeats commands is followed by the robot, and a gyroscope shows it.
+    for gyro in (None, replace(run.gyro, omega=np.gradient(shown, 0.02))):
+        check = check_motion(run.odometry, (run.stamps_ns, seen), gyro, commands=True)
+        assert not any('follow' in text for text in check.wrong)
+
+
+@pytest.mark.parametrize(('late_s', 'every'), [(0.45, 1), (-0.3, 1), (0.15, 3)])
+def test_a_delay_or_few_images_are_no_stabilization(late_s, every):
+    run = drive(*DRIVES['straight legs'][:1], yaw_noise=0.02, seed=2)
+    jitter = np.random.default_rng(0).normal(0.0, 0.02, len(run.stamps_ns))
+    stamps_ns = run.stamps_ns + np.round((late_s + jitter) * 1e9).astype(np.int64)
+    check = check_motion(run.odometry, (stamps_ns[::every], run.poses[::every, 2]), run.gyro)
+    assert check.wrong == [] and not any('clock' in text for text in check.corrected)
 
 
 def test_a_drive_that_hardly_turns_says_nothing():

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores
 from sfa_localization.bags.decoding import typestore
 from sfa_localization.bags.drives import read_drives
 from sfa_localization.bags.reader import Bag
-from sfa_localization.bags.static_transforms import camera_place
+from sfa_localization.bags.static_transforms import lever_arm
 from sfa_localization.bags.writer import BagWriter, blank
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import ConfigError, DataError
@@ -183,7 +183,7 @@ LINKS = [
 def test_static_transforms_say_where_the_camera_sits(tmp_path, links, frames, place):
     path = static_bag(tmp_path / 'bag', links, *frames)
     with Bag(path) as bag:
-        lever = camera_place(bag, '/image', '/odom')
+        lever = lever_arm(bag, '/image', '/odom')
     assert lever == (place if place is None else pytest.approx(place))
 
 

@@ -7,6 +7,7 @@ import dataclasses
 import math
 
 import pytest
+import yaml
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import ConfigError, LocalizationError, MessageError
@@ -17,7 +18,7 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterType
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_dict_from_yaml_file
 from ros_bench import until
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
@@ -103,6 +104,19 @@ def test_a_list_has_real_numbers_also_while_it_is_empty(knobs):
             assert node.settings(Knobs).path == tuple(value)
             told = node.get_parameter('path').get_parameter_value()
             assert told.type == node.describe_parameter('path').type == doubles
+
+
+def test_what_ros2_param_dumps_can_be_loaded(bench, tmp_path):
+    """Read-only parameters that keep their values are accepted, also those of qos_overrides."""
+    node, path = bench.run(Echo), tmp_path / 'dump.yaml'
+    names = [name for name in node.list_parameters([], 0).names if name != 'use_sim_time']
+    assert sum(node.describe_parameter(name).read_only for name in names) == len(names) > 10
+    values = {name: node.get_parameter(name).value for name in names}
+    path.write_text(yaml.safe_dump({'/echo': {'ros__parameters': values}}))
+    for name, told in parameter_dict_from_yaml_file(str(path)).items():
+        assert node.set_parameters([Parameter.from_parameter_msg(told)])[0].successful, name
+    both = [Parameter('autostart', value=value) for value in (True, False)]
+    assert 'autostart' in node.set_parameters_atomically(both).reason
 
 
 class Echo(LocalizationNode):

@@ -2,11 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The omnicam node on real messages: panoramas, demand, bad pictures, live parameters, sources."""
 
+import array
 import dataclasses
+import itertools
+import sys
+from contextlib import suppress
+from types import SimpleNamespace
+from typing import NamedTuple
+from unittest import mock
 
 import cv2
 import numpy as np
 import pytest
+import test_video
 
 from sfa_localization.camera import watch
 from sfa_localization.camera.calibration_files import calibration_text
@@ -17,6 +25,7 @@ from sfa_localization.camera.settings import CameraConfig, LensCalibration, Pano
 
 pytest.importorskip('rclpy')
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Quaternion
 from rclpy.parameter import Parameter
@@ -25,13 +34,16 @@ from ros_bench import until
 from sensor_msgs.msg import CompressedImage, Image, Imu
 from std_msgs.msg import String
 
+from sfa_localization.camera.video import ImageReader
+from sfa_localization.data.errors import CameraError
+from sfa_localization.data.messages import read_stamp
 from sfa_localization.nodes.conversions import (
-    read_image,
     read_info,
     to_compressed,
     to_image,
     to_stamp,
 )
+from sfa_localization.nodes.image_input import ImageInput
 from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.nodes.omnicam_node import OmnicamNode
 
@@ -45,6 +57,15 @@ STAMP_NS = 12_000_000_034
 def raw_picture(seed=1):
     noise = np.random.default_rng(seed).integers(0, 256, (40, 40, 3), np.uint8)
     return cv2.resize(noise, (640, 640), interpolation=cv2.INTER_CUBIC)
+
+
+class CompressedVideo(NamedTuple):
+    """As in foxglove_msgs, which wheels of ROS lack."""
+
+    timestamp: Time
+    frame_id: str
+    data: bytes
+    format: str
 
 
 def message(seed=1, stamp_ns=STAMP_NS):
@@ -65,7 +86,9 @@ def answer(bench, heard, sent, topic='image_raw'):
 
 
 def pixels(sent):
-    return read_image(sent)[1]
+    """The image of a message."""
+    ((_, image),) = ImageReader(type(sent).__name__).add(1, sent)
+    return image
 
 
 def test_frame_and_quality_of_service_by_parameter(bench, tmp_path):
@@ -121,6 +144,39 @@ def test_compressed_pictures_in_and_out(bench):
     assert np.corrcoef(decoded.ravel(), expected.ravel())[0, 1] > 0.6
 
 
+def test_video_in_of_which_some_packets_may_wait(bench):
+    _, heard = start(bench, image_transport='compressed')
+    (node,), topic = bench.nodes, 'image_raw/compressed'
+    for number, data in itertools.cycle(test_video.encoded()):
+        sent = CompressedImage(format='h264', data=array.array('B', data))
+        sent.header.stamp = to_stamp(STAMP_NS + number)
+        bench.publish(topic, sent)
+        if until(lambda: len(heard) >= 12, 0.02):
+            break
+    for told in heard:
+        number = read_stamp(told.header.stamp) - STAMP_NS
+        expected = Unwrapper(MIRROR, PANORAMA)(test_video.scene(number))
+        assert np.abs(pixels(told) - expected.astype(int)).mean() < 12
+    entity = f'qos_overrides./{topic}.subscription_video.depth'
+    assert node.get_parameter(entity).value == 30
+
+
+def test_messages_of_video_of_other_packages(monkeypatch):
+    """Their packages are no dependencies."""
+    package, node, heard = SimpleNamespace(CompressedVideo=CompressedVideo), mock.Mock(), []
+    monkeypatch.setitem(sys.modules, 'foxglove_msgs', package)
+    monkeypatch.setitem(sys.modules, 'foxglove_msgs.msg', package)
+    images = ImageInput(node, 'foxglove', 'image_raw/foxglove', lambda *seen: heard.append(seen))
+    images.start()
+    receive = node.subscribe.call_args.args[2]
+    packets = test_video.encoded(key_every=12)[8:]
+    for number, data in packets:
+        with suppress(CameraError):
+            receive(CompressedVideo(to_stamp(number), 'camera', data, 'h264'))
+    expected = [(number, 'camera') for number, _ in packets if number >= 12]
+    assert [(stamp, frame) for stamp, _, frame in heard] == expected
+
+
 def test_nobody_listens_nothing_is_done(bench):
     node = bench.run(OmnicamNode, **SMALL)
     level, text, _ = node.health()
@@ -168,17 +224,33 @@ def test_masks_elevation_and_mount_change_while_running_and_are_declared(bench):
     assert until(lambda: np.array_equal(pixels(answer(bench, heard, message())), expected))
 
 
+def test_panoramas_of_the_camera_are_mounted_and_masked(bench):
+    """Also those that need no description."""
+    given = {'camera_model': '', 'blind_sectors': [100.0, 140.0], 'mount_rpy': [5.0, 0.0, 30.0]}
+    _, heard = start(bench, **given)
+    camera = CameraConfig(**{k: tuple(v) if k != 'camera_model' else v for k, v in given.items()})
+    strip = raw_picture()[:120]
+    panorama = answer(bench, heard, to_image(strip, STAMP_NS, 'camera'))
+    expected = Unwrapper(camera, PANORAMA)(strip)
+    np.testing.assert_array_equal(pixels(panorama), expected)
+    assert not np.array_equal(expected, Unwrapper(CameraConfig(), PANORAMA)(strip))
+
+
 def with_rules(*rules):
     return {'cli_args': ['--ros-args', *(word for rule in rules for word in ('-r', rule))]}
 
 
-def test_impossible_cameras_do_not_start_and_impossible_changes_are_rejected(bench):
+def test_impossible_cameras_do_not_start_and_impossible_changes_are_rejected(bench, monkeypatch):
     """Nor one that would hear itself."""
+    monkeypatch.setitem(sys.modules, 'ffmpeg_image_transport_msgs', None)
     loop = {'options': with_rules('image_raw:=panorama')}
     for parameters, words in (
         ({'calibration_file': 'nowhere.yaml'}, 'nowhere.yaml'),
         ({'elevation_min': 60.0, 'elevation_max': 80.0}, 'sees no part'),
+        ({'camera_model': '', 'mask_file': 'nowhere.png'}, 'mask_file is missing'),
+        ({'camera_model': '', 'blind_sectors': [-180.0, 180.0]}, 'sees no part'),
         (loop, 'which this node itself publishes: remap'),
+        ({'image_transport': 'ffmpeg'}, 'apt install ros-$ROS_DISTRO-ffmpeg-image-transport-msgs'),
     ):
         node = bench.run(OmnicamNode, start=False, **SMALL | parameters)
         assert not node.start() and words in node.failure
@@ -237,7 +309,16 @@ def test_a_folder_of_pictures_in_order_of_their_names(bench, tmp_path):
     for number, told in enumerate(heard[:3]):
         np.testing.assert_array_equal(pixels(told), unwrap(raw_picture(number)))
         assert told.header.frame_id == 'omnicam'
-    stamps = [read_image(told)[0] for told in heard]
+    stamps = [read_stamp(told.header.stamp) for told in heard]
     assert stamps == sorted(stamps) and stamps[0] > 10**18
     (reason,) = node.monitors[str(tmp_path)].refused
     assert 'c.png' in reason
+
+
+def test_a_source_that_is_not_there_is_logged(bench, tmp_path, capfd):
+    path = str(tmp_path / 'missing')
+    node = bench.run(OmnicamNode, source='folder', source_path=path)
+    why = f'cannot open: folder {path} is missing'
+    assert until(lambda: node.monitors[path].refused == {why: 1})
+    bench.do(lambda: None)  # the callback that counts it has ended
+    assert f'{path}: {why}' in capfd.readouterr().err

@@ -28,7 +28,7 @@ MODULES = {
 }
 ROS = {'rclpy', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',
        'lifecycle_msgs', 'nav_msgs', 'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'std_msgs',
-       'std_srvs', 'tf2_msgs'}  # fmt: skip
+       'std_srvs', 'tf2_msgs', 'visualization_msgs'}  # fmt: skip
 # The rooms: which other rooms each may import (always its own), and which packages beyond the
 # standard library. A module belongs to its folder, or is a room of its own; there is no
 # default, so a new one must be added here, and to the diagram of CONTRIBUTING.
@@ -36,9 +36,9 @@ NUMERIC = {'numpy', 'scipy'}
 CORE = {'data', 'camera', 'sfa', 'keyframes', 'metric', 'fusion', 'bags'}
 ROOMS: dict[str, tuple[set[str], set[str]]] = {
     '__init__': (set(), set()),
-    '__main__': ({'cli'}, set()),
+    '__main__': ({'cli', '__init__'}, set()),
     'data': (set(), {'numpy', 'threadpoolctl', 'tqdm', 'yaml'}),
-    'camera': ({'data'}, NUMERIC | {'cv2', 'yaml'}),
+    'camera': ({'data'}, NUMERIC | {'cv2', 'yaml', 'av'}),
     'sfa': ({'data', 'camera', 'keyframes'}, NUMERIC | {'cv2', 'mdp'}),
     'keyframes': ({'data', 'camera'}, NUMERIC | {'cv2'}),
     'fusion': ({'data'}, NUMERIC | {'filterpy'}),
@@ -57,8 +57,8 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'filtering': ({'data', 'fusion'}, {'numpy'}),
     'reports': ({'data', 'metric', 'training', 'inspection'}, {'numpy', 'matplotlib'}),
     'nodes': (
-        {'data', 'camera', 'fusion', 'place_model', 'observer', 'config'},
-        {'numpy', 'yaml'} | ROS,
+        {'data', 'camera', 'fusion', 'metric', 'place_model', 'observer', 'config'},
+        {'numpy', 'yaml', 'nav2_msgs'} | ROS,  # nav2_msgs where it is installed
     ),
     'config': (CORE | {'nodes'}, {'yaml'}),
     'commands': (
@@ -264,6 +264,28 @@ def test_a_missing_package_is_named_with_its_remedy_if_it_is_optional(capsys):
         assert error.count('\n') == 1
     with pytest.raises(ModuleNotFoundError):
         cli.guarded(partial(run, 'numpy'))
+
+
+INTERRUPTED = """
+import os, signal, sys
+class Finder:
+    @staticmethod
+    def find_spec(name, *_):
+        if name == {!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Finder)
+sys.argv = ['/bin/ekf_node']
+from sfa_localization import __main__
+sys.exit(__main__.{}())
+"""
+
+
+@pytest.mark.parametrize('start', ['main', 'executable'])
+@pytest.mark.parametrize('module', ['sfa_localization.cli', 'sfa_localization.nodes.entry'])
+def test_ctrl_c_while_python_imports_leaves_no_traceback(module, start):
+    command = [sys.executable, '-c', INTERRUPTED.format(module, start)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 
 
 def test_ctrl_c_while_a_command_is_imported_prints_a_line(monkeypatch, capsys):

@@ -9,8 +9,12 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+from rosbags.typesys import Stores
 from test_cameras import CAMERAS
 
+from sfa_localization.bags.decoding import typestore
+from sfa_localization.bags.drives import ReadingRecipe, as_live, read_drive
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama, panorama_rays
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
@@ -88,7 +92,7 @@ def test_a_panorama_is_only_resized_turned_and_reversed_to_the_convention():
     big = PanoramaConfig(width=720, height=96)
     other = dataclasses.replace(SMALL, clockwise=False)
     for config, panorama in (
-        (declared, SMALL), (CameraConfig(mount_rpy=turned.mount_rpy), SMALL), (declared, big),
+        (declared, SMALL), (mirror(mount_rpy=turned.mount_rpy), SMALL), (declared, big),
         (declared, other),
     ):  # fmt: skip
         result = Unwrapper(config, panorama)(picture)
@@ -167,3 +171,62 @@ def test_wrong_masks_and_pictures_are_refused():
     ):  # fmt: skip
         with pytest.raises(CameraError, match=words):
             Unwrapper(config, SMALL)(picture)
+
+
+@pytest.mark.parametrize('clockwise', [True, False])
+@pytest.mark.parametrize('model', ['', 'panorama'])
+def test_a_panorama_that_the_camera_gives_is_mounted_and_masked(model, clockwise, tmp_path):
+    """In any size. Its columns grow as declared; with camera_model: panorama clockwise."""
+    panorama, mount = dataclasses.replace(SMALL, clockwise=clockwise), (4.0, -3.0, 40.0)
+    lens = LensCalibration(camera_model='panorama')
+    order = slice(None, None, 1 if clockwise or model else -1)
+    cv2.imwrite(str(tmp_path / 'mask.png'), np.full((10, 6), [[0, *[255] * 5]], np.uint8)[:, order])
+    for size in ((24, 180), (48, 360)):
+        config = CameraConfig(camera_model=model, mount_rpy=mount)
+        unwrapper = Unwrapper(config, panorama)
+        seen = unwrapper.visible(size)
+        assert 0.7 < seen.mean() < 1.0 and unwrapper.repeated is not None
+        assert unwrapper.mount_rpy == mount
+        tilted = picture_of(smooth, lens, size, mount)[:, order]
+        assert psnr(unwrapper(tilted)[seen], direct(smooth, panorama)[seen]) > 30
+        level = picture_of(smooth, lens, size)[:, order]
+        for hiding, hidden in (
+            ({'blind_sectors': (100.0, 140.0)}, np.abs(AZIMUTH - 120) < 20),
+            ({'mask_file': str(tmp_path / 'mask.png')}, AZIMUTH > 120),
+        ):
+            unwrapper = Unwrapper(CameraConfig(camera_model=model, **hiding), panorama)
+            result = unwrapper(level)
+            seen = np.broadcast_to(~hidden[:: 1 if clockwise else -1], (24, 180))
+            np.testing.assert_array_equal(unwrapper.visible(size), seen)
+            assert np.abs(result[seen] - direct(smooth, panorama)[seen]).max() < 4
+            # A model masks again: nothing changes.
+            again = result.reshape(-1, 3)[unwrapper.repeated]
+            np.testing.assert_array_equal(again, result)
+    untouched = Unwrapper(CameraConfig(camera_model=model), panorama)
+    assert untouched.repeated is None and untouched.mount_rpy == ()
+
+
+def test_recorded_panoramas_are_mounted_and_masked_in_their_size(tmp_path):
+    """Those of omnicam_node, beside their geometry, are mounted already; and a mask file that is
+    missing is an error at once."""
+    panorama = PanoramaConfig(width=360, height=48)
+    picture = picture_of(smooth, LensCalibration(camera_model='panorama'), (48, 360))
+    camera = CameraConfig(mount_rpy=(0.0, 0.0, 90.0), blind_sectors=(100.0, 140.0))
+    for name, expected in (
+        ('plain', Unwrapper(camera, panorama)(picture)),
+        ('made', Unwrapper(dataclasses.replace(camera, mount_rpy=(0.0,) * 3), panorama)(picture)),
+    ):
+        with BagWriter(tmp_path / name) as bag:
+            for at in (10**18, 10**18 + 10**8):
+                bag.image('/front/panorama', at, picture, 'camera')
+                bag.odometry('/odom', at, (0, 0, 0), (0, 0), (0, 0))
+            info = typestore(Stores.ROS2_JAZZY).types['std_msgs/msg/String'](data='{}')
+            if name == 'made':
+                bag.message('/front/panorama/info', 10**18, info)
+        run = read_drive(tmp_path / name, tmp_path, ReadingRecipe(camera=camera))
+        np.testing.assert_array_equal(run.panoramas.read(0, 1)[0], expected)
+        missing = ReadingRecipe(camera=CameraConfig(mask_file='nowhere.png'))
+        learned = as_live(ReadingRecipe(), PanoramaConfig(), camera.mount_rpy)
+        assert learned.camera.mount_rpy == camera.mount_rpy
+        with pytest.raises(CameraError, match=r'mask_file is missing or is no image \(nowhere.png'):
+            read_drive(tmp_path / name, tmp_path, missing)

@@ -93,13 +93,14 @@ def test_wrong_pictures_are_refused_with_the_reason():
     good = {'data': b'1' * 144, 'height': 6, 'width': 8, 'step': 24, 'encoding': 'bgr8'}
     for change, reason in (
         ({'encoding': 'hsv9'}, 'unsupported encoding'), ({'width': 0}, 'empty'),
-        ({'step': 0}, 'empty'), ({'data': b'1' * 143}, 'data size'),
+        ({'step': 0, 'width': 7}, 'step is 0'), ({'data': b'1' * 143}, 'data size'),
         ({'data': b'1' * 145}, 'data size'), ({'height': 2**63}, 'data size'),
         ({'width': 9}, 'step is shorter'),
         ({'encoding': 'yuv422', 'width': 7, 'step': 24}, 'unusable'),
     ):  # fmt: skip
         with pytest.raises(CameraError, match=reason):
             decode_image(**{**good, **change})
+    np.testing.assert_array_equal(decode_image(**{**good, 'step': 0}), decode_image(**good))
 
 
 def test_no_encoding_dies_of_a_tiny_or_odd_picture():
@@ -133,8 +134,28 @@ def test_wrong_files_are_refused_with_the_reason():
     whole = encode_jpeg(noise(), 90)
     for data, kind, reason in (
         (b'', 'jpeg', 'empty'), (b'hello, not a picture', 'jpeg', 'not an image file'),
-        (whole[: len(whole) // 2], 'jpeg', 'truncated'),
+        (whole[: len(whole) // 2], 'jpeg', 'cut-off'),
         (b'1234', '16UC1; compressedDepth', 'depth'),
     ):  # fmt: skip
         with pytest.raises(CameraError, match=reason):
             decode_compressed(data, kind)
+
+
+@pytest.mark.parametrize('restart_interval', [0, 1, 7])
+def test_a_jpeg_whose_data_are_lost_is_refused_and_a_gray_one_is_not(restart_interval):
+    """Data are lost between the markers of begin and end; cameras may add some at the end."""
+    rng = np.random.default_rng(3)
+    scene = cv2.resize(rng.integers(0, 256, (12, 40, 3), np.uint8), (250, 100))
+    masked, below, dark = scene.copy(), scene.copy(), scene // 20
+    masked[:, 150:], below[60:] = 128, 0
+    complete = [scene, scene[..., 0], masked, below, dark, np.full_like(scene, 128)]
+    for image in complete:
+        options = [cv2.IMWRITE_JPEG_RST_INTERVAL, restart_interval]
+        jpeg = cv2.imencode('.jpg', image, options)[1].tobytes()
+        for whole in (jpeg, jpeg[:-2] + b'extra' + jpeg[-2:]):
+            assert decode_compressed(whole).shape == (100, 250, 3)
+    jpeg = cv2.imencode('.jpg', scene, options)[1].tobytes()
+    for start, length in rng.uniform((0.3, 0.1), (0.7, 0.3), (20, 2)):
+        first, end = int(start * len(jpeg)), int((start + length) * len(jpeg))
+        with pytest.raises(CameraError, match='cut-off JPEG'):
+            decode_compressed(jpeg[:first] + jpeg[end:])

@@ -60,6 +60,22 @@ def test_prediction_to_a_stamp_recalls_and_extrapolates_less_and_less_sure():
     assert np.isfinite(later[-1].covariance).all() and later[-1].pose[0] < 6.5
 
 
+def test_a_forgotten_pose_may_be_anywhere_and_what_was_learned_of_the_robot_stays():
+    config, drive = FilterConfig(initial_pose=(0.0, 0.0, 0.0)), FilterDrive(seconds=60, **NOISY)
+    fused = PoseFilter(config)
+    fused.forget_pose()
+    fused.add_odometry(START_NS - 10**8, 0.0, 0.0)
+    assert fused.state is None, 'nor does it start at the configured pose'
+    drive.feed(fused, heading=True, stop=40)
+    before = fused.state
+    fused.forget_pose()
+    assert fused.state is None and fused.status.level is Level.UNINITIALISED
+    drive.kidnap(399, (8.0, -3.0, 2.0))
+    ((_, update, error, _),) = drive.feed(fused, heading=True, start=40, stop=40.05)
+    assert update.reason == 'started' and error < 0.6
+    assert np.array_equal(fused.state.mean[5:9], before.mean[5:9])
+
+
 # Time.
 
 
@@ -167,6 +183,34 @@ def test_turns_show_by_how_much_images_are_stamped_late(late_s):
         assert any('synchronize the clocks' in reason for reason in fused.status.reasons)
     else:
         assert np.mean(errors[-500:]) < 0.15 and fused.status.level is Level.LOCALISED
+
+
+@pytest.mark.parametrize('ahead_s', [37, -18.0, -3600.5, 0.2])
+def test_an_offset_of_clocks_is_used_once_turns_confirm_it(ahead_s):
+    drive, fused = FilterDrive(seconds=90, rate_hz=25, every=4, **NOISY), PoseFilter()
+    fused.expect(Rig(camera_delay=Quantity(0.0, 0.05)))
+    for stamp_ns, kind, index in drive.events(stop=60):
+        if kind:  # images arrive 0.12 s late
+            shown = max(index - 1, 0)
+            stamp_ns = int(drive.stamps_ns[drive.pictures[shown]]) + round(ahead_s * SECOND)
+            fused.add_turned(stamp_ns, float(drive.poses[drive.pictures[shown], 2]))
+            update = drive.give(fused, (stamp_ns, 1, shown), True)
+        else:
+            drive.give(fused, (stamp_ns, 0, index))
+    assert fused.status.level is Level.LOCALISED and fused.status.reasons == ()
+    assert drive.error(fused, index)[0] < 0.2 and abs(update.stamp_ns - stamp_ns) < SECOND
+    said = [name for name in fused.counts if name.startswith('images: stamped')]
+    assert len(said) == (abs(ahead_s) > 1)
+
+
+def test_images_that_only_arrive_late_are_not_taken_for_those_of_another_clock():
+    drive, fused = FilterDrive(seconds=60, rate_hz=25, every=4, **NOISY), started()
+    events = sorted(drive.events(), key=lambda event: event[0] + event[1] * 8 * SECOND)
+    for stamp_ns, kind, index in events:
+        if kind:
+            fused.add_turned(stamp_ns, float(drive.poses[drive.pictures[index], 2]))
+        drive.give(fused, (stamp_ns, kind, index), True)
+    assert not any(name.startswith('images: stamped') for name in fused.counts)
 
 
 def test_a_delay_that_turns_contradict_gives_way_and_the_pose_follows():

@@ -7,12 +7,13 @@ import math
 
 import numpy as np
 import pytest
-from picture_readers import SIZE, PictureReader, panorama
+from picture_readers import DROVE, SIZE, PictureReader, panorama
 
 from sfa_localization.camera.watch import EXPLAINED_WARNING, FROZEN_IMAGES
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.camera_clock import NEAR_NS
+from sfa_localization.metric.settings import GroundConfig
 from sfa_localization.observer import UNKNOWN_VARIANCE
 from sfa_localization.place_model import PlaceModel
 
@@ -20,11 +21,13 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, QuaternionStamped
+from nav_msgs.msg import OccupancyGrid
 from rclpy.parameter import Parameter
 from ros_bench import until
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
 
 from sfa_localization.data.messages import read_planar, read_stamp
 from sfa_localization.nodes import conversions as convert
@@ -93,6 +96,22 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
     assert until(lambda: len(turned) == 2), 'those between are not used'
     assert read_stamp(turned[1].header.stamp) == 5_000_000_001 + NEAR_NS
     assert until(lambda: 'no image on /panorama for' in told[-1].status[0].message)
+
+
+def test_a_panorama_of_the_camera_itself_is_mounted_as_in_training(bench, models):
+    """That of omnicam_node, which declares it, is so already."""
+    models['a.npz'].mount_rpy = (0.0, 0.0, 90.0)
+    node = bench.run(SfaNode, model='a.npz')
+    poses = bench.listen(PoseStamped, 'sfa/pose')
+    turned = np.roll(panorama(PLACE, 1), SIZE.width // 4, axis=1)
+    bench.publish('panorama', message(image=turned))
+    assert until(lambda: len(poses) == 1)
+    bench.publish('panorama/info', declared(), latched_qos())
+    assert until(lambda: node.monitors['panorama/info'].used == 1)
+    bench.publish('panorama', message(seed=2))
+    assert until(lambda: len(poses) == 2)
+    for pose in (poses[0].pose, poses[-1].pose):
+        assert read_planar(pose.position, pose.orientation) == pytest.approx(PLACE, abs=1e-3)
 
 
 def test_an_unusable_image_gives_no_pose_and_is_reported(bench, models):
@@ -186,6 +205,22 @@ def test_the_model_changes_in_every_state_and_a_bad_one_is_refused(bench, models
     bench.publish('panorama', message())
     assert until(lambda: heard) and heard[0].pose.position.x >= 100
     assert node.health()[2]['model'] == 'b.npz'
+
+
+def test_the_driven_ground_is_published_for_late_viewers(bench, models):
+    bench.run(SfaNode, model='b.npz')
+    grids, lines = [], []
+    bench.node.create_subscription(OccupancyGrid, 'sfa/map', grids.append, latched_qos())
+    bench.node.create_subscription(MarkerArray, 'sfa/map_paths', lines.append, latched_qos())
+    assert until(lambda: grids and lines)
+    info, cells = grids[-1].info, DROVE.cells(GroundConfig())
+    values = np.reshape(grids[-1].data, (info.height, info.width))
+    assert np.array_equal(values == 0, cells.driven) and set(values.ravel()) == {0, -1}
+    assert [info.origin.position.x, info.origin.position.y] == cells.corner.tolist()
+    (marker,) = lines[-1].markers
+    assert [(p.x, p.y) for p in marker.points] == [(0.0, 1.0), (0.5, 1.0), (0.5, 1.0), (0.5, 1.5)]
+    assert [(c.r, c.g) for c in marker.colors] == [(0.0, 1.0), (0.5, 0.5), (0.5, 0.5), (1.0, 0.0)]
+    assert marker.header.frame_id == grids[-1].header.frame_id == 'map'
 
 
 def test_the_model_is_read_again_when_asked(bench, models):

@@ -1,22 +1,29 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a bag: decoded by rosbags, and the values of their fields."""
+"""Messages of a bag: decoded by rosbags, and the values of their fields.
+
+A CompressedVideo has a header, too.
+"""
 
 from __future__ import annotations
 
 import functools
 import math
+from types import SimpleNamespace
 from typing import Any
 
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from sfa_localization.bags.files import Topic
-from sfa_localization.camera.encodings import read_compressed, read_raw
+from sfa_localization.bags.satellite_fixes import fix_of
 from sfa_localization.data.errors import BagError, MessageError
-from sfa_localization.data.messages import read_planar, read_twist, require_sane
-from sfa_localization.data.run import Image
+from sfa_localization.data.messages import read_odometry, read_planar, require_sane
 
 IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
+PACKET, VIDEO = 'ffmpeg_image_transport_msgs/msg/FFMPEGPacket', 'foxglove_msgs/msg/CompressedVideo'
+IMAGES = (IMAGE, COMPRESSED, PACKET, VIDEO)
+"""Types with an image of the camera."""
 ODOMETRY, IMU, TF = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu', 'tf2_msgs/msg/TFMessage'
 STAMPED_POSES = (
     'geometry_msgs/msg/PoseStamped',
@@ -25,16 +32,30 @@ STAMPED_POSES = (
 )
 POSES = (ODOMETRY, *STAMPED_POSES, TF)
 """Types with a pose of the robot."""
-PLACES = (*STAMPED_POSES[:2], 'geometry_msgs/msg/PointStamped')
+FIX = 'sensor_msgs/msg/NavSatFix'
+PLACES = (*STAMPED_POSES[:2], 'geometry_msgs/msg/PointStamped', FIX)
 """Types with a measured point."""
 SERIALIZATIONS = {'cdr': Stores.ROS2_JAZZY, 'ros1': Stores.ROS1_NOETIC}
 """The standard types of each wire format."""
-typestore = functools.cache(get_typestore)
-"""The standard message types of a distribution."""
+_VIDEO_TYPES = {
+    PACKET: 'std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\n'
+    'uint8 flags\nbool is_bigendian\nuint8[] data',
+    VIDEO: 'time timestamp\nstring frame_id\nuint8[] data\nstring format',
+}
+"""Definitions of the messages that the standard types lack."""
+
+
+@functools.cache
+def typestore(store: Stores) -> Typestore:
+    """The standard message types of a distribution, and those of video."""
+    types = get_typestore(store)
+    for kind, text in _VIDEO_TYPES.items():
+        types.register(get_types_from_msg(text, kind))
+    return types
 
 
 def can_decode(topic: Topic) -> bool:
-    """Whether the messages of a topic are of a standard type."""
+    """Whether the type of a topic is known."""
     store = SERIALIZATIONS.get(topic.serialization)
     return store is not None and topic.kind in typestore(store).fielddefs
 
@@ -44,9 +65,12 @@ def decode(data: bytes, topic: Topic) -> Any:
     types = typestore(SERIALIZATIONS[topic.serialization])
     ros1 = topic.serialization == 'ros1'
     try:
-        return (types.deserialize_ros1 if ros1 else types.deserialize_cdr)(data, topic.kind)
+        message: Any = (types.deserialize_ros1 if ros1 else types.deserialize_cdr)(data, topic.kind)
     except Exception as error:  # a parser of foreign bytes fails in many ways
         raise MessageError(f'damaged message ({type(error).__name__})') from None
+    if topic.kind == VIDEO:
+        message.header = SimpleNamespace(stamp=message.timestamp, frame_id=message.frame_id)
+    return message
 
 
 def transform_to(frame: str, message: Any, topic: str) -> Any:
@@ -58,23 +82,44 @@ def transform_to(frame: str, message: Any, topic: str) -> Any:
     return frames.get(frame.lstrip('/'))
 
 
-def image_of(message: Any) -> Image:
-    """Image (H, W, 3) BGR of an Image or CompressedImage. Raises CameraError."""
-    return (read_compressed if message.__msgtype__ == COMPRESSED else read_raw)(message)
-
-
 def pose_of(message: Any) -> tuple[float, float, float]:
-    """Planar pose x m, y m, yaw rad of a message or transform. Raises MessageError."""
+    """Planar pose x m, y m, yaw rad of a message or transform; latitude, longitude, 0 of a fix.
+    Raises MessageError.
+    """
     kind = message.__msgtype__
-    if kind == 'geometry_msgs/msg/TransformStamped':
-        return read_planar(message.transform.translation, message.transform.rotation)
-    pose = message.pose if kind == 'geometry_msgs/msg/PoseStamped' else message.pose.pose
-    return read_planar(pose.position, pose.orientation)
+    if kind == FIX:
+        return (*fix_of(message)[:2], 0.0)
+    return read_planar(*_position_and_orientation(message))
+
+
+def true_pose_of(message: Any) -> tuple[float, float, float]:
+    """The same of a ground truth: trackers and receivers without headings leave the quaternion at
+    zero, which counts as yaw 0.
+    """
+    if message.__msgtype__ == FIX:
+        return pose_of(message)
+    position, q = _position_and_orientation(message)
+    if any((q.x, q.y, q.z, q.w)):
+        return read_planar(position, q)
+    require_sane('pose', position.x, position.y)
+    return float(position.x), float(position.y), 0.0
+
+
+def _position_and_orientation(message: Any) -> tuple[Any, Any]:
+    if message.__msgtype__ == 'geometry_msgs/msg/TransformStamped':
+        return message.transform.translation, message.transform.rotation
+    stamped = message.__msgtype__ == 'geometry_msgs/msg/PoseStamped'
+    pose = message.pose if stamped else message.pose.pose
+    return pose.position, pose.orientation
 
 
 def place_of(message: Any) -> tuple[float, float, float]:
-    """Place x m, y m and its standard deviation, 0 where unknown. Raises MessageError."""
+    """Place x m, y m, or latitude and longitude of a fix, and its standard deviation, m, 0 where
+    unknown. Raises MessageError.
+    """
     kind, variance = message.__msgtype__, 0.0
+    if kind == FIX:
+        return fix_of(message)
     if kind == 'geometry_msgs/msg/PointStamped':
         point = message.point
     elif kind == 'geometry_msgs/msg/PoseStamped':
@@ -87,5 +132,10 @@ def place_of(message: Any) -> tuple[float, float, float]:
 
 
 def odometry_of(message: Any) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
-    """Pose, and of an Odometry v, omega and their variances; other types have no twist."""
-    return pose_of(message), read_twist(message) if message.__msgtype__ == ODOMETRY else None
+    """Pose, NaN where an Odometry is not filled with one, and of an Odometry v, omega and their
+    variances; other types have no twist.
+    """
+    if message.__msgtype__ != ODOMETRY:
+        return pose_of(message), None
+    pose, twist = read_odometry(message)
+    return pose or (math.nan,) * 3, twist

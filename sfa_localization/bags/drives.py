@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from sfa_localization.bags import decoding
 from sfa_localization.bags.motion_arrays import StampedValues, to_points, to_trajectory, to_yaw_rate
 from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.satellite_fixes import in_plane
 from sfa_localization.bags.settings import BagConfig, TopicNames
-from sfa_localization.bags.static_transforms import camera_place
-from sfa_localization.bags.topic_stream import Stream
+from sfa_localization.bags.static_transforms import lever_arm
+from sfa_localization.bags.topic_stream import Stream, clock_offset
 from sfa_localization.camera.leveling import LeveledPanoramas, tilts_at
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
@@ -29,13 +30,24 @@ from sfa_localization.data.errors import BagError, DataError, MessageError, Mode
 from sfa_localization.data.files import replaced_mode
 from sfa_localization.data.messages import read_tilt, read_yaw_rate
 from sfa_localization.data.progress import progress_bar
-from sfa_localization.data.run import Image, PanoramaArray, Panoramas, Run, Stamps
+from sfa_localization.data.run import (
+    Image,
+    Origin,
+    PanoramaArray,
+    Panoramas,
+    Points,
+    Run,
+    Stamps,
+)
 from sfa_localization.data.sphere import Sphere
 
 ODOMETRY_TOLERANCE_S = 0.5
 """An image is used when odometry before and after it is this near (s); poses are not interpolated
 over a longer pause."""
 _SAME_IMAGE_NS = 1_000_000  # stamps of one image differ by less
+# Uses of topics whose messages are sent when measured, in words.
+_STAMPED_AT_ONCE = {'images': 'images', 'imu': 'gyroscope', 'orientation': 'orientation',
+                    'ground_truth': 'ground truth'}  # fmt: skip
 logger = logging.getLogger(__name__)
 R = TypeVar('R', bound='ReadingRecipe')
 
@@ -45,7 +57,8 @@ class ReadingRecipe:
     """How a bag becomes a run of panoramas.
 
     Images farther than `odometry_tolerance_s` from odometry are left out (0: images before or after
-    all of it), and with `distinct` also repetitions of the previous image.
+    all of it), and with `distinct` also repetitions of the previous image. Fixes of a satellite
+    receiver count from the `origin`, or the first fix without one.
     """
 
     topics: TopicNames = field(default_factory=TopicNames)
@@ -54,14 +67,18 @@ class ReadingRecipe:
     panorama: PanoramaConfig = field(default_factory=PanoramaConfig)
     odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S
     distinct: bool = False
+    origin: Origin | None = None
 
 
-def as_live(recipe: R, panorama: PanoramaConfig) -> R:
+def as_live(recipe: R, panorama: PanoramaConfig, mount_rpy: tuple[float, ...] = ()) -> R:
     """The recipe to read a drive with a model's panorama, as the nodes do: the filter also fuses
-    images far from any odometry.
+    images far from any odometry. Without angles of a mount in the recipe, `mount_rpy` is used.
     """
-    topics = replace(recipe.topics, points_topic='')
-    return replace(recipe, topics=topics, panorama=panorama, odometry_tolerance_s=0.0)
+    topics, camera = replace(recipe.topics, points_topic=''), recipe.camera
+    if mount_rpy and not any(camera.mount_rpy):
+        camera = replace(camera, mount_rpy=mount_rpy)
+    live = replace(recipe, topics=topics, camera=camera, panorama=panorama)
+    return replace(live, odometry_tolerance_s=0.0)
 
 
 def image_folder(output: Path) -> Path:
@@ -88,8 +105,11 @@ def read_drives(
 
     Raises BagError or DataError.
     """
-    distinct = replace(recipe, distinct=True)
-    runs = tuple(read_drive(bag, cache, distinct, progress, strict=strict) for bag in bags)
+    given, drives = replace(recipe, distinct=True), list[Run]()
+    for bag in bags:
+        drives.append(read_drive(bag, cache, given, progress, strict=strict))
+        given = replace(given, origin=drives[-1].origin)
+    runs = tuple(drives)
     for (_, other), (bag, run) in itertools.combinations(zip(bags, runs, strict=True), 2):
         if _same_recording(run, other):
             raise DataError(
@@ -136,52 +156,81 @@ def read_drive(
     with Bag(path, strict=strict, config=recipe.bag) as bag:
         name = bag.find('image', recipe.topics.image)
         try:
-            stored = _PanoramaFile(Path(cache), recipe)
+            stored = _PanoramaFile(Path(cache), recipe, _is_ready(bag, name))
             streams = {'images': bag.stream(name, stored.panorama)}
             streams |= _other_streams(bag, recipe, want_truth)
             values = _read(bag, streams, stored, progress)
             odometry = bag.to_odometry(streams['odometry'], values['odometry'])
-            stamps_ns, near_s = np.array(stored.stamps, np.int64), recipe.odometry_tolerance_s
-            covered = odometry.trajectory.covers(stamps_ns, int(near_s * 1e9))
-            _require_covered(streams['images'], covered, near_s)
+            stamps_ns = np.array(stored.stamps, np.int64) - _by_one_clock(bag, streams, values)
+            covered = odometry.trajectory.covers(stamps_ns, int(recipe.odometry_tolerance_s * 1e9))
+            _require_covered(streams['images'], covered, recipe.odometry_tolerance_s)
             panoramas: Panoramas = stored.finish(stamps_ns, covered)
             if recipe.camera.level_by_imu:
                 imu, tilts = streams['orientation'], values['orientation']
                 panoramas = _leveled(panoramas, imu, tilts, recipe.panorama.sphere)
         except OSError as error:
             raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
-        camera = camera_place(bag, name, streams['odometry'].topic)
+        origin, points = _measured(bag, streams, values, recipe.origin)
+        camera = lever_arm(bag, name, streams['odometry'].topic)
     for problem in bag.problems:
         logger.warning('%s: %s', path, problem)
     counts = {use: stream.count for use, stream in streams.items()}
     yaw_rate = to_yaw_rate(values['imu']) if values.get('imu') else None
     truth = to_trajectory(values['ground_truth']) if values.get('ground_truth') else None
-    points = to_points(values['points']) if values.get('points') else None
-    return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, points, counts, camera)
+    return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, points, counts, camera, origin)
+
+
+def _measured(
+    bag: Bag, streams: dict[str, Stream], values: dict[str, StampedValues], origin: Origin | None
+) -> tuple[Origin | None, Points | None]:
+    """The origin of fixes, and measured points; fixes in `values` become places in its plane."""
+    kinds = {use: bag.topics[stream.topic].kind for use, stream in streams.items()}
+    for use in ('points', 'ground_truth'):
+        if kinds.get(use) == decoding.FIX:
+            origin = origin or values[use][0][1][:2]
+            values[use] = in_plane(values[use], origin)
+    if not values.get('points'):
+        return origin, None
+    lever = None
+    if kinds['points'] == decoding.FIX:
+        lever = lever_arm(bag, streams['points'].topic, streams['odometry'].topic)
+    return origin, to_points(values['points'], lever or 0j)
+
+
+def _is_ready(bag: Bag, topic: str) -> bool:
+    """Whether images are those of omnicam_node, which also publishes their geometry: it has mounted
+    and masked the camera.
+    """
+    return f'{topic.removesuffix("/compressed")}/info' in bag.topics
 
 
 class _PanoramaFile:
     """Makes panoramas of one size, and stores them in a temporary file."""
 
-    def __init__(self, folder: Path, recipe: ReadingRecipe) -> None:
+    def __init__(self, folder: Path, recipe: ReadingRecipe, is_ready: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as the run
         self._unwrap = Unwrapper(recipe.camera, recipe.panorama)
+        self._unwrap.check()
+        if is_ready:
+            masked = CameraConfig(blind_sectors=recipe.camera.blind_sectors)
+            self._unwrap = Unwrapper(masked, recipe.panorama)
         self._watch = FrozenWatch() if recipe.distinct else None
         self.stamps: list[int] = []
         self._shape: tuple[int, ...] = ()
 
-    def panorama(self, message: Any) -> Image:
-        """The panorama of a message. Raises LocalizationError."""
-        image = decoding.image_of(message)
-        if not looks_like_panorama(*image.shape[:2]):
-            image = self._unwrap(image)
+    def panorama(self, image: Image) -> Image:
+        """The panorama of a camera's image. Raises LocalizationError."""
+        if looks_like_panorama(*image.shape[:2]):
+            if not self._shape:
+                self._unwrap = self._unwrap.keeping_size((image.shape[0], image.shape[1]))
+            elif image.shape != self._shape:
+                height, width = self._shape[:2]
+                raise MessageError(f'size is not {width}x{height} like the first image')
+        image = self._unwrap(image)
         if self._watch is not None and not self._watch.add(image):
             raise MessageError('image repeats the one before')
         self._shape = self._shape or image.shape
-        if image.shape != self._shape:
-            height, width = self._shape[:2]
-            raise MessageError(f'size is not {width}x{height} like the first image')
         return image
 
     def add(self, stamp_ns: int, image: Image) -> None:
@@ -218,7 +267,7 @@ def _other_streams(bag: Bag, recipe: ReadingRecipe, want_truth: bool) -> dict[st
         streams['points'] = bag.stream(name, decoding.place_of)
     if want_truth:
         name = bag.find('ground_truth', topics.ground_truth)
-        streams['ground_truth'] = bag.stream(name, decoding.pose_of)
+        streams['ground_truth'] = bag.stream(name, decoding.true_pose_of)
     return streams
 
 
@@ -237,6 +286,21 @@ def _read(
             else:
                 values[uses[id(stream)]].append((stamp_ns, value))
     return values
+
+
+def _by_one_clock(bag: Bag, streams: dict[str, Stream], values: dict[str, StampedValues]) -> int:
+    """Stamp the values by the clock of the odometry, where their reception shows another one; log
+    it, and return by how much, ns, the stamps of the images are ahead of it.
+    """
+    images_ns = 0
+    for use, stream in streams.items():
+        if use in _STAMPED_AT_ONCE:
+            ahead_ns, text = clock_offset(_STAMPED_AT_ONCE[use], stream, streams['odometry'])
+            values[use] = [(stamp_ns - ahead_ns, value) for stamp_ns, value in values[use]]
+            images_ns = ahead_ns if use == 'images' else images_ns
+            if text:
+                logger.warning('%s: %s', bag.path, text)
+    return images_ns
 
 
 def _leveled(panoramas: Panoramas, imu: Stream, tilts: StampedValues, sphere: Sphere) -> Panoramas:

@@ -74,8 +74,11 @@ def add_problem(problems: list[str], text: str) -> None:
 
 
 def describe(error: Exception) -> str:
-    """The text of a library's error, or its class."""
-    return short_line(str(error)).rstrip('.') or type(error).__name__
+    """The text of an error, or its class."""
+    return (
+        short_line(str(getattr(error, 'strerror', None) or error)).rstrip('.')
+        or type(error).__name__
+    )
 
 
 class McapFile:

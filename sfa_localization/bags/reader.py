@@ -19,9 +19,11 @@ from sfa_localization.bags import motion_arrays as motion
 from sfa_localization.bags.files import ZSTD_MAGIC, Record, Topic, add_problem, inflate_message
 from sfa_localization.bags.motion_arrays import StampedValues
 from sfa_localization.bags.recording import Recording
+from sfa_localization.bags.satellite_fixes import in_plane
 from sfa_localization.bags.settings import BagConfig
 from sfa_localization.bags.topic_stream import Item, Stream
-from sfa_localization.data.errors import BagError, LocalizationError, MessageError
+from sfa_localization.camera.video import ImageReader
+from sfa_localization.data.errors import BagError, DataError, LocalizationError, MessageError
 from sfa_localization.data.messages import NO_STAMP, read_stamp
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory
 
@@ -42,13 +44,15 @@ class Kind(NamedTuple):
     accepted: tuple[str, ...]
 
 
-_IMAGES, _TRUTH = (decoding.IMAGE, decoding.COMPRESSED), decoding.STAMPED_POSES
+_IMAGES, _TRUTH = decoding.IMAGES, decoding.STAMPED_POSES
 KINDS = {
     'image': Kind('images', '--image-topic', _IMAGES, _IMAGES),
     'odometry': Kind('odometry', '--odom-topic', (decoding.ODOMETRY,), decoding.POSES),
     'imu': Kind('yaw rates', '--imu-topic', (decoding.IMU,), (decoding.IMU,)),
     'points_topic': Kind('measured places', '--points-topic', decoding.PLACES, decoding.PLACES),
-    'ground_truth': Kind('true poses', '--ground-truth-topic', _TRUTH, decoding.POSES),
+    'ground_truth': Kind(
+        'true poses', '--ground-truth-topic', _TRUTH, (*decoding.POSES, decoding.FIX)
+    ),
 }
 
 
@@ -126,32 +130,46 @@ class Bag:
 
     def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
         """Stamps and images (H, W, 3) BGR, one at a time."""
-        return self._values(self.stream(self.find('image', topic), decoding.image_of))
+        return self._values(self.stream(self.find('image', topic), lambda image: image))
 
     def trajectory(self, topic: str = '') -> Trajectory:
         """All poses of a topic, by default of the true poses."""
-        stream = self.stream(self.find('ground_truth', topic), decoding.pose_of)
-        return motion.to_trajectory(list(self._values(stream)))
+        stream = self.stream(self.find('ground_truth', topic), decoding.true_pose_of)
+        values = list(self._values(stream))
+        if self.topics[stream.topic].kind == decoding.FIX:
+            values = in_plane(values, values[0][1][:2])
+        return motion.to_trajectory(values)
 
     def _values(self, stream: Stream) -> Iterator[tuple[int, Any]]:
         return ((stamp_ns, value) for _, stamp_ns, value in self.read([stream]))
 
     def to_odometry(self, stream: Stream, values: StampedValues) -> Odometry:
-        """Odometry from a stream's values; an oddity is noted as a problem."""
-        odometry, oddity = motion.to_odometry(values)
-        self.problems += [f'{stream.topic}: {oddity}'] if oddity else []
+        """Odometry from a stream's values; oddities are noted as problems, and faulty messages are
+        counted as skipped. Raises BagError for two publishers.
+        """
+        try:
+            odometry, oddities, faults = motion.to_odometry(values, stream.topic)
+        except DataError as error:
+            raise BagError(f'{self.path}: {error}') from None
+        self.problems += [f'{stream.topic}: {oddity}' for oddity in oddities]
+        for reason, number in faults.items():
+            stream.skipped.add(reason, number)
+            stream.used -= number
         return odometry
 
     def stream(self, name: str, convert: Callable[[Any], Any], *, required: bool = True) -> Stream:
-        """A topic to be read; of a required TFMessage, '/tf:FRAME' selects a transform.
+        """A topic to be read: `convert` is called with images (H, W, 3) BGR, or with messages.
 
-        Messages of unknown types have the value None.
+        Of a required TFMessage, '/tf:FRAME' selects a transform; messages of unknown types have the
+        value None.
         """
         topic, _, frame = name.partition(':')
         stream = self._streams[topic] = Stream(self.path, topic, convert, self.strict)
         stream.required, stream.opaque = required, not decoding.can_decode(self.topics[topic])
         if required and self.topics[topic].kind == decoding.TF:
             stream.frame = frame
+        if self.topics[topic].kind in decoding.IMAGES:
+            stream.images = ImageReader(_short([self.topics[topic].kind]))
         return stream
 
     def read(self, streams: Iterable[Stream]) -> Iterator[tuple[Stream, int, Any]]:
@@ -159,37 +177,44 @@ class Bag:
 
         Raises BagError when a topic has no usable message, or in strict reading on any loss.
         """
-        by_topic: dict[str, list[Stream]] = {}
+        by_topic, receive_ns = dict[str, list[Stream]](), 0
         for stream in streams:
             by_topic.setdefault(stream.topic, []).append(stream)
         for record in self.messages(by_topic):
+            receive_ns = record[1]
             for stream in by_topic[record[0].name]:
                 stream.received += 1
-                item = self._item(stream, *record)
-                yield from _used(stream, stream.push(item) if item is not None else ())
+                for item in stream.values(self._parts(stream, *record), receive_ns):
+                    yield from _used(stream, stream.push(item))
         for stream in itertools.chain(*by_topic.values()):
+            delayed = stream.images.finish() if stream.images else []
+            for item in stream.values(delayed, receive_ns):
+                yield from _used(stream, stream.push(item))
             yield from _used(stream, stream.flush())
             self._check_complete(stream)
 
-    def _item(self, stream: Stream, topic: Topic, receive_ns: int, data: bytes) -> Item | None:
-        """The stamp and value of a message; None of one that is rejected and counted."""
+    def _parts(
+        self, stream: Stream, topic: Topic, receive_ns: int, data: bytes
+    ) -> list[tuple[int, Any]]:
+        """Stamps, and a message, the images that are complete with it, or the error in it."""
         if stream.opaque:
-            return Item(receive_ns, receive_ns, None)
+            return [(receive_ns, None)]
         try:
             part = decoding.decode(data, topic)
             if stream.frame is not None:
                 part = decoding.transform_to(stream.frame, part, topic.name)
             if part is None:
                 stream.skipped.add('transforms of other frames')
-                return None
+                return []
             header = getattr(part, 'header', None) if self._by_header else None
             stamp_ns = receive_ns if header is None else read_stamp(header.stamp)
-            return Item(stamp_ns, receive_ns, stream.convert(part))
+            if stream.images is None:
+                return [(stamp_ns, part)]
+            return stream.images.add(stamp_ns, part)
         except BagError:
             raise
         except LocalizationError as error:
-            stream.skip(str(error))
-            return None
+            return [(receive_ns, error)]
 
     def messages(self, topics: Iterable[str], start_ns: int = 0) -> Iterator[Record]:
         """Topic, reception in ns and serialized bytes, in the order of recording."""

@@ -13,11 +13,11 @@ from sfa_localization.data.settings import Settings, setting
 class TopicNames(Settings):
     """Topics of a bag; an empty name is found by its type. Of /tf, name '/tf:CHILD_FRAME'."""
 
-    image: str = setting('', 'images: Image or CompressedImage')
+    image: str = setting('', 'images: Image, CompressedImage, CompressedVideo or FFMPEGPacket')
     odometry: str = setting('', 'wheel odometry: Odometry, or any pose when named')
     imu: str = setting('', 'yaw rate: Imu')
     points_topic: str = setting(
-        '', 'measured places: PoseWithCovarianceStamped, PoseStamped or PointStamped'
+        '', 'measured places: NavSatFix, PoseWithCovarianceStamped, PoseStamped or PointStamped'
     )
     ground_truth: str = setting('', 'true poses, read for evaluation only')
 

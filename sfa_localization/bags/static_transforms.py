@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The lever arm of the camera from the static transforms of a bag."""
+"""The lever arm of a camera or an antenna from the static transforms of a bag."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from sfa_localization.data.messages import require_sane
 TOPIC = '/tf_static'
 
 
-def camera_place(bag: Bag, image_topic: str, odometry_topic: str) -> complex | None:
-    """Camera position, ahead + i left, m, in the child frame of the odometry; None where static
-    transforms do not connect both frames.
+def lever_arm(bag: Bag, sensor_topic: str, odometry_topic: str) -> complex | None:
+    """Position of a sensor, ahead + i left, m, in the child frame of the odometry; None where
+    static transforms do not connect both frames.
     """
     topic = bag.topics.get(TOPIC)
     if topic is None or not decoding.can_decode(topic):
         return None
     frames, parents, transforms = dict[str, str](), dict[str, tuple[str, Array]](), 0
-    for record, _, data in bag.messages({TOPIC, image_topic, odometry_topic}):
+    for record, _, data in bag.messages({TOPIC, sensor_topic, odometry_topic}):
         if record.name in frames and record.name != TOPIC:
             continue
         try:
@@ -38,12 +38,11 @@ def camera_place(bag: Bag, image_topic: str, odometry_topic: str) -> complex | N
             continue
         if len(frames) == 2 and transforms >= topic.count:
             break
-    camera = _to_root(frames.get(image_topic, ''), parents)
+    sensor = _to_root(frames.get(sensor_topic, ''), parents)
     base = _to_root(frames.get(odometry_topic, ''), parents)
-    if len(frames) < 2 or camera[0] != base[0]:
+    if len(frames) < 2 or sensor[0] != base[0]:
         return None
-    lever_arm = np.linalg.solve(base[1], camera[1])[:2, 3]
-    return complex(*lever_arm)
+    return complex(*np.linalg.solve(base[1], sensor[1])[:2, 3])
 
 
 def _links(message: object) -> dict[str, tuple[str, Array]]:

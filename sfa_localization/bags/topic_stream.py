@@ -4,19 +4,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sfa_localization.data.errors import BagError
+import numpy as np
+
+from sfa_localization.camera.video import ImageReader
+from sfa_localization.data.errors import BagError, LocalizationError
+from sfa_localization.data.events import CLOCK_JUMP_NS, CLOCK_RANGE_S, LEAP_SECONDS, whole_leap
 from sfa_localization.data.messages import NO_STAMP
 from sfa_localization.data.rejections import RejectionCounter
 from sfa_localization.data.run import Count
-
-CLOCK_JUMP_NS = 10_000_000_000
-"""A difference this large (10 s) between the steps of stamp and reception is a jump of the sender's
-clock: queues and networks delay a message by less."""
 
 
 class Item(NamedTuple):
@@ -48,9 +48,9 @@ class Item(NamedTuple):
 class Stream:
     """One topic being read, with the number of used messages, and of skipped ones by reason.
 
-    `convert` makes a value of a message, or of its transform to `frame`. Messages of an opaque
-    stream are not decoded: their value is None. `strict` raises for a faulty message; a `required`
-    stream must have a usable message.
+    `convert` makes a value of a message, of its transform to `frame`, or of an image that
+    `images` reads. Messages of an opaque stream are not decoded: their value is None. `strict`
+    raises for a faulty message; a `required` stream must have a usable message.
 
     Messages pass in increasing order of stamp, each when the next one has come. A single stamp that
     is ahead of the next is skipped, as is a jump that the next does not continue; a lasting jump is
@@ -62,6 +62,7 @@ class Stream:
     convert: Callable[[Any], Any]
     strict: bool
     frame: str | None = None
+    images: ImageReader | None = None
     required: bool = True
     opaque: bool = False
     received: int = 0
@@ -69,10 +70,19 @@ class Stream:
     skipped: RejectionCounter = field(default_factory=RejectionCounter)
     _last: Item | None = None
     _waiting: Item | None = None
+    _ahead_ns: list[int] = field(default_factory=list)
 
     @property
     def count(self) -> Count:
         return Count(self.used, dict(self.skipped))
+
+    @property
+    def ahead_ns(self) -> tuple[float, float]:
+        """By how much stamps are ahead of the reception, by the median of the messages used, and
+        the range of the middle 80 % of them.
+        """
+        low, middle, high = np.percentile(self._ahead_ns or [0], (10, 50, 90))
+        return float(middle), float(high - low)
 
     def skip(self, reason: str) -> None:
         """Count a message that is faulty. Raises BagError in strict reading."""
@@ -80,6 +90,18 @@ class Stream:
             raise BagError(f'{self.bag}: {self.topic}: {reason}; '
                            'read without --strict to skip such messages')  # fmt: skip
         self.skipped.add(reason)
+
+    def values(self, parts: Iterable[tuple[int, Any]], receive_ns: int) -> Iterator[Item]:
+        """The values of messages or images; faulty ones are counted."""
+        for stamp_ns, part in parts:
+            try:
+                if isinstance(part, LocalizationError):
+                    raise part
+                yield Item(stamp_ns, receive_ns, part if self.opaque else self.convert(part))
+            except BagError:
+                raise
+            except LocalizationError as error:
+                self.skip(str(error))
 
     def push(self, item: Item) -> list[Item]:
         """The message to be used now, if any; the latest is held back until `flush`."""
@@ -113,4 +135,26 @@ class Stream:
             self.skip('stamp jumps')
             return []
         self._last = waiting
+        self._ahead_ns.append(waiting.stamp_ns - waiting.receive_ns)
         return [waiting]
+
+
+def clock_offset(name: str, stream: Stream, odometry: Stream) -> tuple[int, str]:
+    """By how much, ns, a stream's stamps are ahead of those of the odometry by the reception of
+    both, and a sentence; 0 and '' for less than turns show, for what queues may have delayed, and
+    for bags that do not hold the times of reception.
+    """
+    (ahead, spread), (other, other_spread) = stream.ahead_ns, odometry.ahead_ns
+    offset, range_ns = ahead - other, CLOCK_RANGE_S * 1e9
+    queued = min(ahead, other) > -CLOCK_JUMP_NS and max(ahead, other) < range_ns
+    # If a bag holds no times of reception, stamps are ahead by the length of the drive.
+    if abs(offset) <= max(range_ns, spread, other_spread) or queued:
+        return 0, ''
+    offset_ns = whole_leap(offset)
+    seconds = abs(offset_ns) * 1e-9
+    scale = LEAP_SECONDS.get(round(seconds), '')
+    if scale:
+        scale = f' ({stream.topic if offset > 0 else odometry.topic} in {scale}?)'
+    where = 'ahead of' if offset > 0 else 'behind'
+    text = f'{name}: stamped {seconds:.1f} s {where} the odometry, by their reception{scale}'
+    return offset_ns, f'{text}: taken into account'

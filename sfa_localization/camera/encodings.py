@@ -8,6 +8,7 @@ their significant bits, an alpha channel is dropped, gray becomes three equal ch
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,6 +58,11 @@ _LAYOUTS |= dict.fromkeys(('yuyv', 'yuv422_yuy2'), _Layout(2, code=cv2.COLOR_YUV
 _LAYOUTS['nv12'] = _Layout(1, code=cv2.COLOR_YUV2BGR_NV12, rows=(3, 2))
 _LAYOUTS['nv21'] = _Layout(1, code=cv2.COLOR_YUV2BGR_NV21, rows=(3, 2))
 _SENSOR_BITS = (10, 12, 14, 16)  # depths of pixels that are sent as two bytes
+_CUT_OFF = 'cut-off JPEG: the data of a part of it are lost'
+_FILL = 128  # gray level of blocks for which libjpeg has no data
+_MARKER, _END = re.compile(rb'\xff[\x01-\xfe]'), b'\xff\xd9'  # in a JPEG, and the last one
+_RESTARTS = range(0xD0, 0xD8)  # markers between parts of a JPEG, numbered in a circle
+_MORE_DATA = bytes(range(1, 65))
 _LARGEST_FILE = 1 << 28  # bytes of an image file
 ENCODINGS = tuple(_LAYOUTS)
 """The encodings that `decode_image` understands, in lower case."""
@@ -67,18 +73,24 @@ def decode_image(
 ) -> Image:
     """Decode raw image data, as in ``sensor_msgs/Image``, to BGR (height, width, 3) uint8.
 
-    `data` is any buffer of bytes, `step` the bytes per row. The result may be a read-only view of
-    `data`. Raises CameraError with the reason in a few words.
+    `data` is any buffer of bytes, `step` the bytes per row: 0, as of drivers that leave it out,
+    where rows follow each other without a gap. The result may be a read-only view of `data`. Raises
+    CameraError with the reason in a few words.
     """
     layout = _LAYOUTS.get(encoding.lower())
     if layout is None:
         raise CameraError(f'unsupported encoding {encoding!r}')
-    if min(height, width, step) <= 0:
+    if min(height, width) <= 0 or step < 0:
         raise CameraError('empty image')
     buffer, rows = _bytes(data), height * layout.rows[0] // layout.rows[1]
+    used = width * layout.channels * layout.depth
+    if not step and buffer.size != rows * used:
+        raise CameraError(
+            f'step is 0, but a row has {used} bytes or more: the driver leaves it out'
+        )
+    step = step or used
     if buffer.size != rows * step:
         raise CameraError('data size is not rows times step')
-    used = width * layout.channels * layout.depth
     if step < used:
         raise CameraError('step is shorter than a row')
     pixels = buffer.reshape(rows, step)[:, :used]
@@ -116,15 +128,16 @@ def decode_compressed(data: Any, format: str = '') -> Image:
     """Decode a JPEG, PNG, BMP, PNM, TIFF or WebP file to BGR (H, W, 3) uint8.
 
     `format` is that of ``sensor_msgs/CompressedImage``; only a compressed Bayer mosaic needs it. A
-    truncated JPEG is rejected: OpenCV would fill it with gray. Raises CameraError.
+    cut-off JPEG is rejected: OpenCV would fill it with gray. Raises CameraError.
     """
     if 'compresseddepth' in format.lower():
         raise CameraError('a depth image is no camera image')
     buffer = _bytes(data)
     if buffer.size == 0:
         raise CameraError('empty image')
-    if buffer[:2].tobytes() == b'\xff\xd8' and b'\xff\xd9' not in buffer.tobytes():
-        raise CameraError('truncated JPEG')
+    is_jpeg = buffer[:2].tobytes() == b'\xff\xd8'
+    if is_jpeg and _END not in buffer.tobytes():
+        raise CameraError(_CUT_OFF)
     original, _, packed = format.lower().partition(';')
     mosaic = original.startswith('bayer_') and 'bgr' not in packed and 'rgb' not in packed
     color = cv2.IMREAD_GRAYSCALE if mosaic else cv2.IMREAD_COLOR
@@ -132,12 +145,34 @@ def decode_compressed(data: Any, format: str = '') -> Image:
     image = _checked(cv2.imdecode, buffer, flags)
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise CameraError('not an image file that OpenCV reads')
+    if is_jpeg and _lacks_data(buffer.tobytes(), image, flags):
+        raise CameraError(_CUT_OFF)
     image = _to_8_bits(image) if image.dtype == np.uint16 else np.asarray(image)
     if not mosaic:
         return image
     height, width = image.shape
     name = f'{original.strip().rstrip("0123456789")}8'
     return decode_image(image.tobytes(), height, width, width, name)
+
+
+def _lacks_data(data: bytes, image: Image, flags: int) -> bool:
+    """Whether libjpeg had no data for blocks of an image (H, W) or (H, W, 3): it makes them gray.
+
+    They may be gray in the camera's image, too. But more data, before each marker that ends a part
+    of the file, change only blocks without data. Lost markers leave a gap in their numbers.
+    """
+    gray = (image[3::8, ::2] == _FILL).reshape(len(image[3::8]), -1, image[0, 0].size).all(2)
+    if not (np.packbits(gray, axis=1) == 255).any():  # eight samples in a row of a block
+        return False
+    head, start, rest = data.rpartition(b'\xff\xda')
+    parts, end, rest = rest.partition(_END)
+    restarts = [marker[1] for marker in _MARKER.findall(parts) if marker[1] in _RESTARTS]
+    if restarts != [_RESTARTS[k % 8] for k in range(len(restarts))]:
+        return True
+    parts = _MARKER.sub(lambda marker: _MORE_DATA + marker[0], parts) + _MORE_DATA
+    parts += bytes([0xFF, _RESTARTS[len(restarts) % 8]]) + _MORE_DATA if restarts else b''
+    longer = np.frombuffer(head + start + parts + end + rest, np.uint8)
+    return not np.array_equal(image, _checked(cv2.imdecode, longer, flags))
 
 
 def read_image(path: Path | str) -> Image:
@@ -169,8 +204,3 @@ def read_raw(message: Any) -> Image:
     """Image (H, W, 3) uint8 BGR of a ``sensor_msgs/Image``. Raises CameraError."""
     size = message.height, message.width, message.step
     return decode_image(message.data, *size, message.encoding, bool(message.is_bigendian))
-
-
-def read_compressed(message: Any) -> Image:
-    """Image (H, W, 3) uint8 BGR of a ``sensor_msgs/CompressedImage``. Raises CameraError."""
-    return decode_compressed(message.data, message.format)

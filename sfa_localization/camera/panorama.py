@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -21,10 +21,11 @@ from sfa_localization.camera.settings import (
     PanoramaConfig,
 )
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.geometry import Array, Mask
+from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.run import Image
 
 _ASPECT = 3.5  # an image wider than this times its height is a panorama
+_ANY_PANORAMA = 1, 4  # rows, columns
 
 
 def looks_like_panorama(height: int, width: int) -> bool:
@@ -83,16 +84,15 @@ class Unwrapper:
     def __call__(self, image: Image) -> Image:
         """Unwrap a BGR image (H, W, 3) uint8 to (panorama.height, panorama.width, 3) uint8.
 
-        An image shaped like a panorama is only resized. Raises CameraError for any other array, and
-        for an image of another camera.
+        An image that is a panorama already is resized before. Raises CameraError for any other
+        array, and for an image of another camera.
         """
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
             raise CameraError('an image must be an array of uint8')
         if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
             raise CameraError(f'an image must have shape (H, W, 3), not {image.shape}')
         size = (image.shape[0], image.shape[1])
-        if self.is_panorama(size):
-            return self._aligned(image)
+        image = self._resized(image) if self.is_panorama(size) else image
         tables = self._tables_of(size)
         maps = tables.pixels, tables.fractions
         return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=tables.border))
@@ -101,33 +101,71 @@ class Unwrapper:
         """Mask (H, W) of the panorama pixels visible in images of `size` (rows, columns)."""
         return self._tables_of(size).visible
 
+    def check(self, size: tuple[int, int] | None = None) -> None:
+        """Raise CameraError for a lens, mount, mask or sector that cannot be used for images of
+        `size` (rows, columns), by default of that of the calibration, or panoramas.
+        """
+        if self.camera.mask_file:
+            read_mask(self.camera.mask_file, _ANY_PANORAMA)
+        lens = self.calibration if self.model else None
+        size = size or ((lens.image_height, lens.image_width) if lens else _ANY_PANORAMA)
+        if 0 not in size:
+            self.visible(size)
+
     def is_panorama(self, size: tuple[int, int]) -> bool:
-        """Whether images of `size` (rows, columns) are panoramas, which are only resized."""
+        """Whether images of `size` (rows, columns) are panoramas already."""
         if self.model == 'panorama':
-            return not any(self.camera.mount_rpy[:2])
+            return True
         return self.model != 'equirectangular' and looks_like_panorama(*size)
 
-    def _aligned(self, image: Image) -> Image:
-        """A panorama, resized; that of a panorama camera is also turned to forward."""
+    @property
+    def repeated(self) -> Indices | None:
+        """The pixel of a panorama, row by row, that each (H, W) repeats; None: all are visible."""
+        size = self.panorama.height, self.panorama.width
+        visible = build_tables(*self._of_panoramas(), self.panorama, size).visible
+        rows, columns = nearest_visible(visible)
+        return None if visible.all() else rows * size[1] + columns
+
+    @property
+    def mount_rpy(self) -> tuple[float, ...]:
+        """The angles by which panoramas of the camera are resampled, degrees; () for none."""
+        mount_rpy = self._of_panoramas()[0].mount_rpy
+        return mount_rpy if any(mount_rpy) else ()
+
+    def keeping_size(self, size: tuple[int, int]) -> Unwrapper:
+        """The same for panoramas of `size` (rows, columns), which keep it."""
+        panorama = replace(self.panorama, height=size[0], width=size[1])
+        return Unwrapper(self.camera, panorama, self._calibration)
+
+    def _resized(self, image: Image) -> Image:
+        """A panorama of another size, resized."""
         height, width = self.panorama.height, self.panorama.width
         shrinks = image.shape[0] > height or image.shape[1] > width
         method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        result = image.copy()
-        if image.shape[:2] != (height, width):
-            result = np.asarray(cv2.resize(image, (width, height), interpolation=method))
-        if self.model != 'panorama':
-            return result
-        shift = -round(self.camera.mount_rpy[2] / 360.0 * width)
-        if self.calibration.is_mirrored:
-            result = result[:, ::-1]
-        result = np.roll(result, shift, axis=1)
-        return np.ascontiguousarray(result if self.panorama.clockwise else result[:, ::-1])
+        return np.asarray(cv2.resize(image, (width, height), interpolation=method))
 
     def _tables_of(self, size: tuple[int, int]) -> _Tables:
+        """The tables for images of a size; those of panoramas are for the resized ones."""
+        is_panorama = self.is_panorama(size)
+        size = (self.panorama.height, self.panorama.width) if is_panorama else size
         if size not in self._tables:
-            tables = build_tables(self.camera, self.calibration, self.panorama, size)
-            self._tables = {size: tables}
+            lens = self._of_panoramas() if is_panorama else (self.camera, self.calibration)
+            self._tables = {size: build_tables(*lens, self.panorama, size)}
         return self._tables[size]
+
+    def _of_panoramas(self) -> tuple[CameraConfig, LensCalibration]:
+        """The camera and lens of images that are panoramas already.
+
+        With the lens of another camera they come from omnicam_node, which has mounted and masked
+        them.
+        """
+        if self.model == 'panorama':
+            return self.camera, self.calibration
+        # Their columns grow as declared.
+        mirrored = 'no' if self.panorama.clockwise else 'yes'
+        calibration = LensCalibration(camera_model='panorama', mirrored=mirrored)
+        masked = CameraConfig(blind_sectors=self.camera.blind_sectors)
+        return masked if self.model else self.camera, calibration
 
 
 def build_tables(

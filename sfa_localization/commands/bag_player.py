@@ -27,7 +27,7 @@ from rclpy.signals import SignalHandlerOptions
 from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 
-from sfa_localization.bags.decoding import COMPRESSED, IMAGE, ODOMETRY
+from sfa_localization.bags.decoding import IMAGES, ODOMETRY
 from sfa_localization.bags.reader import Bag
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.rejections import encodable
@@ -112,7 +112,7 @@ def _await_subscribers(
     node: Node, bag: Bag, publishers: dict[str, Publisher], wait_s: float
 ) -> None:
     """Wait until images and odometry have subscribers and no more come, `wait_s` at most."""
-    kinds = {'images': (IMAGE, COMPRESSED), 'odometry': (ODOMETRY,)}
+    kinds = {'images': IMAGES, 'odometry': (ODOMETRY,)}
     needed = {
         what: [made for name, made in publishers.items() if bag.topics[name].kind in kind]
         for what, kind in kinds.items()

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from sfa_localization.fusion.settings import FilterConfig
 if TYPE_CHECKING:
     from sfa_localization.evaluation import Evaluation
 
+logger = logging.getLogger(__name__)
 WRITES = """\
 tables on standard output; with --report index.html (one page for a browser) and its figures;
   with --json the errors"""
@@ -65,6 +67,11 @@ def run(arguments: argparse.Namespace) -> int:
     options.require_report(arguments.report, arguments.json)
     model = PlaceModel.load(arguments.model)
     options.require_same_panorama(arguments.config, model.panorama)
+    if transform is not None and not model.quality.get('points'):
+        logger.warning(
+            '%s: its map has no measured points, so that its coordinates are its own: train with '
+            '--points or --points-topic, or evaluate with --align TRAIN_BAG', arguments.model,
+        )  # fmt: skip
     result = evaluation.evaluate(
         model,
         arguments.bag,
@@ -79,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     print(tables(result.scores))
     print(*trust_lines(result.scores), sep='\n')
     print(*count_lines(result.counts), sep='\n')
-    print(f'aligned on {result.aligned_on}')
+    print(f'aligned on {result.aligned_on}', *result.corrections, sep='\n')
     if arguments.report:
         _write_report(arguments, result)
     if arguments.json:
@@ -102,5 +109,6 @@ def _write_report(arguments: argparse.Namespace, result: Evaluation) -> None:
     read = images_at(arguments.bag, stamps.values(), options.recipe(arguments))
     samples = {image: read[stamp] for image, stamp in stamps.items() if stamp in read}
     title = f'{arguments.model.name} on {arguments.bag.name}'
-    write_evaluation_page(folder, title, *drive, result.counts, samples)
+    notes = f'The map is aligned on {result.aligned_on}.', *result.corrections
+    write_evaluation_page(folder, title, *drive, result.counts, samples, notes)
     print(f'{folder / PAGE}: written')

@@ -46,7 +46,9 @@ def run(arguments: argparse.Namespace) -> int:
     result = filtering.run_filter(odometry, positions, config, progress=True)
     for table in (odometry, positions):
         if table.skipped:
-            print(f'{table.source}: {table.skipped} rows without a stamp or number left out')
+            count, first = len(table.skipped), table.skipped[0]
+            which = f'left out, the first is line {first}'
+            print(f'{table.source}: {count} rows without a stamp or number {which}')
     for reason, count in sorted(result.counts.items()):
         print(f'{reason}: {count}')
     print(': '.join([result.status.level.name, '; '.join(result.status.reasons)]).rstrip(': '))

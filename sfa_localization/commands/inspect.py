@@ -14,7 +14,7 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.commands import options
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.files import write_json
-from sfa_localization.inspection import BagReport, InspectionConfig, inspect
+from sfa_localization.inspection import BagReport, InspectionConfig, inspect, lacks_together
 
 WRITES = """\
 findings on standard output; with --report index.html (one page for a browser) and its
@@ -25,7 +25,7 @@ EXAMPLES = """\
 
 JSON: {"bags": [{"path", "topics": {NAME: {"type", "count", "recorded",
 "first_stamp_ns", "last_stamp_ns", "rate_hz", "largest_gap_s", "problems"}}, "problems", "lacks",
-...}]}"""
+...}], "together": {"enough_to_train_on", "lacks"}}"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Inspect all bags; an unreadable bag is reported, and the others are still inspected."""
+    """Inspect all bags, each alone and all together; an unreadable bag is reported, and the others
+    are still inspected.
+    """
     topics = options.settings(TopicNames, arguments)
     config = options.settings(InspectionConfig, arguments)
     clockwise = options.settings(PanoramaConfig, arguments).clockwise
@@ -58,12 +60,20 @@ def run(arguments: argparse.Namespace) -> int:
             )
         except BagError as error:
             reports.append(BagReport(str(path), error=str(error)))
+    lacks = lacks_together(reports, config)
     if arguments.json:
-        write_json(arguments.json, {'bags': [report.as_dict() for report in reports]})
+        together = {'enough_to_train_on': not lacks, 'lacks': lacks}
+        bags = [report.as_dict() for report in reports]
+        write_json(arguments.json, {'bags': bags, 'together': together})
     if arguments.report:
         _write_report(arguments.report, reports)
     for report in reports:
         print(report.as_text(), file=sys.stderr if report.error else sys.stdout)
+    if len(reports) > 1:
+        verdicts = [f'together not enough: {lack}' for lack in lacks]
+        print(*(verdicts or ['together: enough to train on']), sep='\n')
+        if lacks:
+            return 1
     return int(any(r.error or any(topic.unreadable for topic in r.topics) for r in reports))
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.commands import options
 from sfa_localization.data.errors import ConfigError
+from sfa_localization.data.files import first_bytes
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.sfa.settings import NetworkConfig
@@ -53,8 +54,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Train or update; print the summary."""
     options.require_output(arguments.output, [*arguments.bags, arguments.config], '.npz')
     options.require_report(arguments.report, arguments.output)
+    replaces = bool(first_bytes(arguments.output)) and arguments.output != arguments.update
+    written = f'{arguments.output}: written' + ', the model that was there is replaced' * replaces
     if arguments.update:
-        return _update(arguments)
+        return _update(arguments, written)
     from sfa_localization import training
     from sfa_localization.reports.summary import summary
 
@@ -71,12 +74,12 @@ def run(arguments: argparse.Namespace) -> int:
     print(summary(trained))
     if arguments.report:
         _write_report(arguments.report, arguments.bags, trained, used)
-    print(f'{arguments.output}: written')
+    print(written)
     return 0
 
 
-def _update(arguments: argparse.Namespace) -> int:
-    """Extend a model; print what was added."""
+def _update(arguments: argparse.Namespace, written: str) -> int:
+    """Extend a model; print what was added, and what was written."""
     unused = [name for name in ('report', 'resume', 'force') if getattr(arguments, name)]
     for group in (SegmentConfig, MetricConfig, NetworkConfig):
         unused += options.given(group, arguments)
@@ -99,7 +102,7 @@ def _update(arguments: argparse.Namespace) -> int:
         strict=arguments.strict,
     )
     print(updated.sentence())
-    print(f'{arguments.output}: written')
+    print(written)
     return 0
 
 

@@ -33,12 +33,22 @@ def read_regular(path: Path | str, largest: int) -> bytes:
     if '\0' in str(path):
         raise OSError('a path with a zero byte')
     if os.path.exists(path) and not os.path.isfile(path):
-        raise OSError('it is no regular file')
+        raise OSError(f'it {absence(path)}')
     with open(path, 'rb') as file:
         data = file.read(largest + 1)
     if len(data) > largest:
         raise OSError(f'larger than {largest} bytes')
     return data
+
+
+def read_text(path: Path | str, largest: int, error: type[LocalizationError]) -> str:
+    """The text of a regular file of at most `largest` bytes. Raises `error` naming the path."""
+    try:
+        return read_regular(path, largest).decode('utf-8-sig')
+    except OSError as reason:
+        raise error(f'{path}: cannot be read: {reason.strerror or reason}') from None
+    except UnicodeDecodeError as reason:
+        raise error(f'{path}: cannot be read: {reason.reason}') from None
 
 
 def first_bytes(path: Path, most: int = 1000) -> bytes:
@@ -102,6 +112,15 @@ def replaced_mode(path: Path) -> int:
     return stat.S_IMODE(status.st_mode)
 
 
+def _require_folder(path: Path) -> None:
+    """Raise OSError for a folder in which no file, or which itself, can be made."""
+    nearest = next(each for each in (path, *path.parents) if each.exists())
+    if not nearest.is_dir():
+        raise OSError(f'{nearest} is no folder')
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise OSError(f'no permission to write in {nearest}')
+
+
 def require_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
     """Raise LocalizationError before the work where atomic_write could not write its results, or
     where they would replace each other or an input.
@@ -113,6 +132,7 @@ def require_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> N
         targets.add(resolved(path))
         try:
             replaced_mode(path)
+            _require_folder(resolved(path).parent)
         except OSError as reason:
             why = reason.strerror or reason
             raise LocalizationError(f'{path}: cannot be written: {why}') from None

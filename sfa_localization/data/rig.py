@@ -110,6 +110,11 @@ class Rig:
         x, y = pose[0] - (lever * mean_turn).real, pose[1] - (lever * mean_turn).imag
         return np.array([x, y, wrap_angle(turn)]), base
 
+    def centers(self, poses: Array) -> Array:
+        """Places (N, 2) m of base_link from poses (N, 3) of the camera."""
+        lever = self.lever * np.exp(1j * (poses[:, 2] - self.camera_yaw.value))
+        return np.column_stack([poses[:, 0] - lever.real, poses[:, 1] - lever.imag])
+
     def camera(self, poses: Array) -> Array:
         """Poses (N, 3) of the camera from those (N, 3) of base_link."""
         moved = self.lever * np.exp(1j * poses[:, 2])

@@ -16,6 +16,8 @@ from sfa_localization.data.geometry import Array, Indices, compose, relative, wr
 
 Stamps = NDArray[np.int64]
 Image = NDArray[np.uint8]
+Origin = tuple[float, float]
+"""Latitude and longitude, degrees, of x = y = 0 where places are those of a satellite receiver."""
 POINT_STD_M = 0.02
 """Standard deviation of a point without one: a robot was put on a mark by eye."""
 BATCH = 16
@@ -106,30 +108,36 @@ class YawRate:
     variance: Array
 
 
+PointRow = tuple[str, int, complex, float, complex]
+
+
 @dataclass(frozen=True, slots=True)
 class Points:
-    """Measured positions of the robot in the frame of the map: `names` (K,), `stamps_ns` (K,),
-    `places` (K,) x + i y m, `std` (K,) m along each axis.
+    """Measured positions in the frame of the map: `names` (K,), `stamps_ns` (K,), `places` (K,)
+    x + i y m, `std` (K,) m along each axis. They are those of an antenna that is `lever` (K,)
+    ahead + i left of base_link, m.
     """
 
     names: tuple[str, ...]
     stamps_ns: Stamps
     places: NDArray[np.complex128]
     std: Array
+    lever: NDArray[np.complex128]
 
     @classmethod
-    def of(cls, rows: Sequence[tuple[str, int, complex, float]]) -> Points:
-        """From the name, stamp, place and standard deviation of each."""
-        names, stamps, places, std = zip(*rows, strict=True)
-        return cls(names, np.array(stamps, np.int64), np.array(places, complex), np.array(std))
+    def of(cls, rows: Sequence[PointRow]) -> Points:
+        """From the rows of `rows`."""
+        names, stamps, *columns = zip(*rows, strict=True)
+        places, std, lever = map(np.array, columns)
+        return cls(names, np.array(stamps, np.int64), places, std, lever)
 
     def __len__(self) -> int:
         return len(self.names)
 
-    def rows(self) -> list[tuple[str, int, complex, float]]:
-        """Name, stamp, place and standard deviation of each."""
-        columns = self.stamps_ns.tolist(), self.places.tolist(), self.std.tolist()
-        return list(zip(self.names, *columns, strict=True))
+    def rows(self) -> list[PointRow]:
+        """Name, stamp, place, standard deviation and lever of each."""
+        columns = self.stamps_ns, self.places, self.std, self.lever
+        return list(zip(self.names, *(column.tolist() for column in columns), strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,11 +203,33 @@ class PanoramaArray:
 
 
 @dataclass(frozen=True, slots=True)
+class StampedPanoramas:
+    """Panoramas with other stamps (N,)."""
+
+    stamps_ns: Stamps
+    panoramas: Panoramas
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.panoramas.shape
+
+    def __len__(self) -> int:
+        return len(self.panoramas)
+
+    def read(self, start: int, stop: int) -> Image:
+        return self.panoramas.read(start, stop)
+
+    def batches(self, size: int) -> Iterator[Image]:
+        return self.panoramas.batches(size)
+
+
+@dataclass(frozen=True, slots=True)
 class Run:
     """One drive: images, odometry, measured points and, for evaluation only, the ground truth.
 
     `counts` holds the used and skipped messages per stream ('images', 'odometry', ...); `camera`
-    is the lever arm of the camera, ahead + i left of base_link, m, if the bag contains it.
+    is the lever arm of the camera, ahead + i left of base_link, m, if the bag contains it. Places
+    of a satellite receiver count from the `origin`.
     """
 
     name: str
@@ -210,6 +240,7 @@ class Run:
     points: Points | None = None
     counts: dict[str, Count] = field(default_factory=dict)
     camera: complex | None = None
+    origin: Origin | None = None
 
 
 def integrate(stamps_ns: Stamps, twists: Array, start: Array | None = None) -> Array:
@@ -225,6 +256,14 @@ def integrate(stamps_ns: Stamps, twists: Array, start: Array | None = None) -> A
     poses[1:, 1] = poses[0, 1] + np.cumsum(chord * np.sin(middle))
     poses[:, 2] = wrap_angle(yaw)
     return poses
+
+
+def chained(start: Array, steps: Array) -> Array:
+    """Poses (N, 3) from a pose (3,) on by steps (N - 1, 3), each seen from the pose before."""
+    yaw = np.concatenate([start[2:], start[2] + np.cumsum(steps[:, 2])])
+    place = np.cumsum((steps[:, 0] + 1j * steps[:, 1]) * np.exp(1j * yaw[:-1]))
+    place = start[0] + 1j * start[1] + np.concatenate([[0.0], place])
+    return np.column_stack([place.real, place.imag, wrap_angle(yaw)])
 
 
 def differences(stamps_ns: Stamps, poses: Array) -> Array:

@@ -20,6 +20,13 @@ from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.rejections import quoted
 
 S = TypeVar('S', bound='Settings')
+_FORMS = {
+    bool: 'true or false',
+    float: 'a number',
+    int: 'a whole number',
+    str: 'a text; put it in quotes',
+    tuple: 'a list of numbers, such as [1.0, 2.5]',
+}
 
 
 def setting(
@@ -68,6 +75,16 @@ class Settings:
             raise ConfigError(f'{where}: {error}') from None
 
 
+def require_pose(name: str, pose: tuple[float, ...]) -> None:
+    """Raise ConfigError for a pose that is neither empty nor x (m), y (m) and yaw (rad)."""
+    if len(pose) not in (0, 3):
+        raise ConfigError(
+            f'{name}: {len(pose)} numbers given; give x (m), y (m) and yaw (rad), or none'
+        )
+    if pose and abs(pose[2]) > 2 * math.pi:
+        raise ConfigError(f'{name}: a yaw of {pose[2]:g} rad is more than a turn: give radians')
+
+
 def nearest(name: str, names: Collection[str]) -> str:
     """The end of a message about an unknown name: the most similar of the names, or ''."""
     close = difflib.get_close_matches(name[:100], sorted(names), n=1)
@@ -83,7 +100,7 @@ def _converted(where: str, default: Any, value: Any) -> Any:
         with suppress(OverflowError):  # of an integer beyond all floats
             return float(value)
     if isinstance(value, bool) != isinstance(default, bool) or not isinstance(value, type(default)):
-        raise ConfigError(f'{where}: {quoted(value)} is not of type {type(default).__name__}')
+        raise ConfigError(f'{where}: {quoted(value)} is not {_FORMS[type(default)]}')
     return value
 
 

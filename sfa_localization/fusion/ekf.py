@@ -138,7 +138,8 @@ class Ekf:
         step = motion.drive(belief.mean, twists[0], dt, self._noise, twists[1])
         odometry = received(belief, event)
         moved = self._moved(belief, event.stamp_ns, step)
-        return moved._replace(twist=twists[1], odometry=odometry)
+        pace = belief.pace.after(event.stamp_ns, twists[1])
+        return moved._replace(twist=twists[1], odometry=odometry, pace=pace)
 
     def _broken(self, belief: Belief, event: OdometryEvent, leap: Jump) -> Belief:
         """The belief after a break of the odometry, by wrong wheel counts or a robot that was
@@ -160,10 +161,14 @@ class Ekf:
         coasted_ns = belief.stamp_ns
         if belief.odometry.stamp_ns is not None:
             coasted_ns = max(coasted_ns, belief.odometry.stamp_ns + round(COAST_S * 1e9))
-        for end_ns, move in ((min(stamp_ns, coasted_ns), motion.coast), (stamp_ns, motion.halt)):
+        changes = belief.pace.changes
+        for end_ns, move, squares in (
+            (min(stamp_ns, coasted_ns), motion.coast, changes),
+            (stamp_ns, motion.halt, changes * COAST_S),
+        ):
             if end_ns > belief.stamp_ns:
                 dt = (end_ns - belief.stamp_ns) * 1e-9
-                step = move(belief.mean, belief.twist, dt, self._noise)
+                step = move(belief.mean, belief.twist, dt, self._noise, squares)
                 belief = self._moved(belief, end_ns, step)
         return belief
 

@@ -41,9 +41,10 @@ ODOMETRY_CORRELATION_S = 0.1  # readings err alike for the time constant of a wh
 BIAS_WALK, SCALE_WALK, LOSS_WALK, DELAY_WALK = 1e-4, 1e-3, 1e-3, 1e-3
 """Random walks: turn-rate bias of a cheap gyroscope, rad/s per sqrt(s); wheel scale, 1/sqrt(m), a
 percent over 100 m; loss in turns, m/rad per sqrt(rad); delay of the camera, s per sqrt(s)."""
-ACCELERATION = 1.0  # change of speed (m/s) and turn rate (rad/s) per sqrt(s) without odometry
-UNKNOWN_SPEED, UNKNOWN_RATE = 0.5, 0.5
-"""Speed (m/s) and turning (rad per sqrt(s)) of a robot whose odometry is silent for long."""
+PRIOR_CHANGE, CHANGES = 1.0, 100
+"""Square of the change of speed (m/s) and turn rate (rad/s) in a second before any is observed,
+that of a hasty robot: it counts as one of the last CHANGES seconds of driving. Seven robots changed
+their turn rates by 0.02 to 0.09."""
 STANDSTILL_SPEED, STANDSTILL_RATE = 1e-3, 2e-3
 """A robot slower (m/s) and turning slower (rad/s) than this stands: encoders and gyros flicker."""
 BIAS_STD = 0.01  # rad/s, of the turn-rate bias before any is learned: cheap gyroscopes
@@ -133,6 +134,37 @@ class Twist(NamedTuple):
         return abs(self.v) >= STANDSTILL_SPEED or abs(self.omega) >= STANDSTILL_RATE
 
 
+class Pace(NamedTuple):
+    """How this robot changes its speed and turn rate: mean squares `v` and `omega`, over `seconds`
+    of driving, of the changes within a second; `last` is the twist from which the next counts.
+    """
+
+    stamp_ns: int = 0
+    last: Twist | None = None
+    v: float = 0.0
+    omega: float = 0.0
+    seconds: int = 0
+
+    def after(self, stamp_ns: int, twist: Twist) -> Pace:
+        """After a reading at a stamp. A robot that stands on, or after a silence, shows nothing."""
+        elapsed_s, last = (stamp_ns - self.stamp_ns) * 1e-9, self.last
+        if last is not None and 0 <= elapsed_s < 1:
+            return self
+        anew = self._replace(stamp_ns=stamp_ns, last=twist)
+        if last is None or not 1 <= elapsed_s < 2 or not (last.moves or twist.moves):
+            return anew
+        seconds = min(self.seconds + 1, CHANGES)
+        v = self.v + ((twist.v - last.v) ** 2 / elapsed_s - self.v) / seconds
+        omega = self.omega + ((twist.omega - last.omega) ** 2 / elapsed_s - self.omega) / seconds
+        return anew._replace(v=v, omega=omega, seconds=seconds)
+
+    @property
+    def changes(self) -> Array:
+        """Variances of the changes of speed and turn rate in a second (2,), with the prior."""
+        observed = self.seconds * np.array([self.v, self.omega])
+        return np.asarray((observed + PRIOR_CHANGE) / (self.seconds + 1))
+
+
 def arc(yaw: float, v: float, omega: float, dt: float) -> tuple[Array, Array]:
     """The motion (3,) over dt, and its derivatives (3, 2) by v and omega; with s = sin(h) / h
 
@@ -191,31 +223,31 @@ def _corrected(mean: Array, twist: Twist) -> tuple[float, float, float]:
     return v, twist.omega - float(mean[BIAS]), by_loss
 
 
-def coast(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
+def coast(mean: Array, twist: Twist, dt: float, noise: MotionNoise, changes: Array) -> Step:
     """Move on without new odometry: v and omega stay, and become less certain (CTRV). The pose
     gets a third of the variance of their random walk, and half of it in common with them.
 
-    `twist` is the last reading, whose noise still counts.
+    `twist` is the last reading, whose noise still counts; `changes` are those of `Pace`.
     """
     v, omega = float(mean[V]), float(mean[OMEGA])
     standing = v == 0.0 and omega == 0.0
     step = _stand(mean) if standing else _advance(mean, v, omega, twist, dt, noise)
-    by_twist, walk = step.jacobian[:3, V:BIAS], ACCELERATION**2 * dt
-    step.noise[:3, :3] += walk / 3 * by_twist @ by_twist.T
-    step.noise[:3, V:BIAS] += walk / 2 * by_twist
-    step.noise[V:BIAS, :3] += walk / 2 * by_twist.T
-    step.noise[V:BIAS, V:BIAS] += walk * np.eye(2)
+    by_twist, walk = step.jacobian[:3, V:BIAS], np.diag(changes * dt)
+    step.noise[:3, :3] += by_twist @ walk @ by_twist.T / 3
+    step.noise[:3, V:BIAS] += by_twist @ walk / 2
+    step.noise[V:BIAS, :3] += walk @ by_twist.T / 2
+    step.noise[V:BIAS, V:BIAS] += walk
     return step
 
 
-def halt(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
-    """Expect no motion, and allow for any: odometry has been silent for too long.
-
-    UNKNOWN_SPEED, or the last reading `twist`, bounds what a robot may have done since.
+def halt(mean: Array, twist: Twist, dt: float, noise: MotionNoise, changes: Array) -> Step:
+    """Expect no motion, and allow for any: odometry has been silent for too long. The robot may go
+    on by the last reading `twist`, or by what `changes` (2,) of speed and turn rate have led to.
     """
-    step, speed = _stand(mean), max(UNKNOWN_SPEED, abs(twist.v))
-    step.noise[[X, Y, V], [X, Y, V]] += speed**2 * np.array([2 * dt, 2 * dt, 1.0])
-    step.noise[[YAW, OMEGA], [YAW, OMEGA]] += UNKNOWN_RATE**2 * np.array([dt, 1.0])
+    step = _stand(mean)
+    speed, rate = np.maximum(np.square(twist[:2]), changes).tolist()
+    step.noise[[X, Y, V], [X, Y, V]] += speed * np.array([2 * dt, 2 * dt, 1.0])
+    step.noise[[YAW, OMEGA], [YAW, OMEGA]] += rate * np.array([dt, 1.0])
     return step
 
 

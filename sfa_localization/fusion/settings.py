@@ -4,11 +4,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.data.settings import Settings, setting
+from sfa_localization.data.settings import Settings, require_pose, setting
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,15 +53,6 @@ class FilterConfig(Settings):
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
-        if len(self.initial_pose) not in (0, 3):
-            raise ConfigError(
-                f'initial_pose: {len(self.initial_pose)} numbers given; '
-                'give x (m), y (m) and yaw (rad), or none'
-            )
-        if self.initial_pose and abs(self.initial_pose[2]) > 2 * math.pi:
-            raise ConfigError(
-                f'initial_pose: a yaw of {self.initial_pose[2]:g} rad is more than a turn: '
-                'give radians'
-            )
+        require_pose('initial_pose', self.initial_pose)
         if self.degraded_std > self.lost_std:
             raise ConfigError('degraded_std must not exceed lost_std')

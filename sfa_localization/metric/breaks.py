@@ -15,9 +15,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, Mask, relative, wrap_angle
-from sfa_localization.data.odometry_steps import beyond, tolerance
-from sfa_localization.data.run import Odometry, Stamps
+from sfa_localization.data.geometry import Array, Mask, relative
+from sfa_localization.data.odometry_steps import JUMP, beyond, tolerance
+from sfa_localization.data.run import Odometry, Stamps, chained
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
 from sfa_localization.keyframes.closures import LIKE
 from sfa_localization.metric.dead_reckoning import pauses, spaced, summed
@@ -76,7 +76,8 @@ def _jumps(odometry: Odometry) -> tuple[Mask, Array, float]:
 
 
 def parted(odometry: Odometry) -> tuple[Odometry, str]:
-    """Odometry that breaks at its pauses and jumps, and a sentence on the jumps; '' for none.
+    """Odometry that breaks at its pauses and jumps, and a sentence on jumps, and on pauses after
+    which the pose is another; '' for none.
 
     Where the twist says that the robot drove on as before, only the pose has jumped: it goes on.
     """
@@ -91,22 +92,34 @@ def parted(odometry: Odometry) -> tuple[Odometry, str]:
     drove_on = np.abs(by_twist - usual).max(axis=1) < tolerance(seconds, noise)
     cut = jump & ~(drove_on & odometry.twists.any())
     odometry = replace(odometry, part=summed(pause | cut).astype(np.int64))
-    if not jump.any():
-        return odometry, ''
     step = relative(odometry.poses[:-1], odometry.poses[1:])
+    elsewhere = _goes_on_elsewhere(odometry, pause, step)
+    if not jump.any():
+        return odometry, elsewhere
     far = float(np.hypot(*(step - usual)[jump, :2].T).max())
     step = np.where(jump[:, None], usual, step)
-    x, y, yaw = odometry.poses[0]
-    yaw = yaw + summed(step[:, 2])
-    place = x + 1j * y + summed((step[:, 0] + 1j * step[:, 1]) * np.exp(1j * yaw[:-1]))
-    poses = np.column_stack([place.real, place.imag, wrap_angle(yaw)])
+    poses = chained(odometry.poses[0], step)
     count, joined = int(jump.sum()), int((jump & ~cut).sum())
     times = 'once' if count == 1 else f'{count} times'
     how = ['joined by its motion around'] * (joined > 0) + ['cut there'] * (joined < count)
     text = f'odometry pose jumps {times}, by up to {far:.2f} m: {" or ".join(how)}'
     if joined > max(seconds.sum() / 60, 1.0):  # a driver is not reset so often
         text += '; if a localization corrects it, record the frame odom instead of map'
-    return replace(odometry, poses=poses), text
+    return replace(odometry, poses=poses), '; '.join(filter(None, (text, elsewhere)))
+
+
+def _goes_on_elsewhere(odometry: Odometry, pause: Mask, step: Array) -> str:
+    """A sentence on pauses (N - 1,) over which the pose makes steps (N - 1, 3); '' for none."""
+    far = np.hypot(step[:, 0], step[:, 1]) * pause
+    rows = np.flatnonzero(far > JUMP)
+    if not len(rows):
+        return ''
+    times, most = ('once', '') if len(rows) == 1 else (f'{len(rows)} times', 'up to ')
+    first_s = (odometry.stamps_ns[rows[0]] - odometry.stamps_ns[0]) * 1e-9
+    return (
+        f'odometry pauses {times}, first after {first_s:.1f} s, and goes on {most}{far.max():.2f} '
+        'm from where it was: cut there'
+    )
 
 
 def contradicted(

@@ -87,11 +87,11 @@ class MeasuredPoints:
         """Points with the nearest of the used `images`, which are numbered drive after drive.
 
         A drive is its odometry and the stamps of its images. A point is of the first drive that
-        covers its stamp. Points are places of base_link, images those of a camera at a `lever` arm,
-        ahead + i left, m.
+        covers its stamp. Points are places of base_link, or of an antenna at its lever arm, images
+        those of a camera at a `lever` arm, ahead + i left, m.
         """
         nearest, offset = np.full(len(points), -1), np.full(len(points), np.inf, complex)
-        start, pending = 0, np.ones(len(points), bool)
+        start, pending, turned = 0, np.ones(len(points), bool), np.ones(len(points), complex)
         for odometry, stamps in drives:
             used = images[(images >= start) & (images < start + len(stamps))] - start
             covered = pending & odometry.trajectory.covers(points.stamps_ns)
@@ -100,11 +100,13 @@ class MeasuredPoints:
             for row in (after - 1, after) if len(used) and covered.any() else ():
                 image = used[row.clip(0, len(used) - 1)]
                 poses = (odometry.trajectory.at(at) for at in (stamps[image], points.stamps_ns))
-                moved = relative(*poses)[:, :2] @ [1, 1j]
-                nearer = covered & (np.abs(moved) < np.abs(offset))
-                nearest[nearer], offset[nearer] = image[nearer] + start, moved[nearer]
+                moved = relative(*poses) @ [[1, 0], [1j, 0], [0, 1j]]
+                nearer = covered & (np.abs(moved[:, 0]) < np.abs(offset))
+                nearest[nearer], offset[nearer] = image[nearer] + start, moved[nearer, 0]
+                turned[nearer] = np.exp(moved[nearer, 1])
             start += len(stamps)
         near = np.abs(offset) <= NEAR_M
+        offset = offset + turned * points.lever
         settled = settled or Settled(np.zeros(len(points), bool))
         return cls(points, np.where(near, nearest, -1), np.where(near, offset - lever, 0), settled)
 
@@ -156,7 +158,7 @@ class MeasuredPoints:
         return {
             'points': [
                 {'name': name, 'x_m': place.real, 'y_m': place.imag, 'miss_m': miss, 'used': used}
-                for (name, _, place, _), miss, used in zip(*columns, strict=True)
+                for (name, _, place, *_), miss, used in zip(*columns, strict=True)
             ],
         }
 
@@ -175,8 +177,8 @@ class MeasuredPoints:
             yield 'two points fit a mirrored drive too: a third shows whether x and y are swapped'
         if count > 1 and not settled.turned:
             yield (
-                'the points are at one place: heading and scale are those of the odometry; measure '
-                'another point some meters away'
+                'the points are at one place, or too inaccurate for their distances: heading and '
+                'scale are those of the odometry; measure another point some meters away'
             )
         if abs(settled.scale - 1.0) > CONTRADICTION:
             yield (

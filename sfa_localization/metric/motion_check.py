@@ -21,9 +21,11 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array, Complex, Indices, relative, wrap_angle
 from sfa_localization.data.odometry_steps import JUMP, NOISE
-from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
+from sfa_localization.data.run import Odometry, Run, StampedPanoramas, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
 from sfa_localization.metric.breaks import StampedTextures, contradicted, parted
+from sfa_localization.metric.motion_clocks import Drift, drift_sentences, drifts, following
+from sfa_localization.metric.motion_gyro import cleaned, is_worse
 from sfa_localization.metric.motion_sources import (
     ENOUGH,
     EQUAL,
@@ -61,6 +63,7 @@ _IMAGES_REMEDIES = {
     'scale': 'a panorama shows all around once, so that a full turn shifts it by its width; or is '
     'the track of the wheels too wide?',
 }
+_STABILIZED = 'switch stabilization off (direction lock, FlowState, horizon lock)'
 _WAY_REMEDIES = {
     'alike': 'is the heading of the pose right?',
     'sign': 'correct the sign of twist.linear.x, or the heading of the pose',
@@ -70,8 +73,8 @@ _WAY_REMEDIES = {
 
 @dataclass
 class MotionCheck:
-    """Comparisons of a drive's sources, `odometry` and `gyro` as corrected, and sentences: on what
-    is `wrong`, was `corrected`, or is worth noting.
+    """Comparisons of a drive's sources, `odometry` and `gyro` as corrected, the drift of the
+    images' clock, and sentences: on what is `wrong`, was `corrected`, or is worth noting.
     """
 
     pairs: list[Pair]
@@ -80,10 +83,22 @@ class MotionCheck:
     wrong: list[str] = field(default_factory=list)
     corrected: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    image_drift: Drift | None = None
 
     def pair(self, a: str, b: str, what: str = 'turns') -> Pair | None:
         """The comparison of b with a."""
         return next((p for p in self.pairs if (p.a, p.b, p.what) == (a, b, what)), None)
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether another device turns like the wheels, or the images turn like the gyroscope."""
+        alike = [
+            pair
+            for pair in self.pairs
+            if pair.what == 'turns' and not any(map(pair.differs, ('alike', 'sign', 'scale')))
+        ]
+        devices = [{pair.a, pair.b} - {TWIST} for pair in alike]
+        return {POSE, IMAGES} in devices or any(GYRO in each and len(each) > 1 for each in devices)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -105,24 +120,31 @@ def check_drives(
     headings: Sequence[Sequence[float]],
     force: bool = False,
     textures: Sequence[NDArray[np.int8] | None] = (),
+    commands: Sequence[bool] = (),
 ) -> tuple[tuple[Run, ...], tuple[MotionCheck, ...]]:
     """Corrected drives, and the comparisons of their sources of motion.
 
     `headings` (N,) rad of each run are the sums of the shifts between its images, and `textures`
-    (N, rows, columns) small versions of these, which show breaks. Raises DataError if a source is
-    wrong; with `force` it only warns.
+    (N, rows, columns) small versions of these, which show breaks. `commands`: whether its odometry
+    repeats commands. Raises DataError if a source is wrong; with `force` it only warns.
     """
-    checks, corrected = [], []
-    for run, yaw, small in zip(runs, headings, textures or [None] * len(runs), strict=True):
+    checks, corrected, count = [], [], len(runs)
+    items = zip(
+        runs, headings, textures or [None] * count, commands or [False] * count, strict=True
+    )
+    for run, yaw, small, repeats in items:
         stamps_ns = run.panoramas.stamps_ns
         views = None if small is None else (stamps_ns, small)
         images = stamps_ns, np.asarray(yaw, float)
-        check = check_motion(run.odometry, images, run.yaw_rate, views=views)
+        check = check_motion(run.odometry, images, run.yaw_rate, views=views, commands=repeats)
         for text in check.corrected + check.notes + (check.wrong if force else []):
             logger.warning('%s: %s', run.name, text)
         if check.wrong and not force:
             raise DataError(f'{run.name}: {"; ".join(check.wrong)} (train --force goes on)')
         checks.append(check)
+        if check.image_drift:
+            stamps_ns = stamps_ns - check.image_drift.late_ns(stamps_ns)
+            run = replace(run, panoramas=StampedPanoramas(stamps_ns, run.panoramas))
         corrected.append(replace(run, odometry=check.odometry, yaw_rate=check.gyro))
     return tuple(corrected), tuple(checks)
 
@@ -133,37 +155,39 @@ def check_motion(
     gyro: YawRate | None = None,
     panoramas: bool = True,
     views: StampedTextures | None = None,
+    commands: bool = False,
 ) -> MotionCheck:
     """Compare all sources of a drive: see `sources_of`, and `contradicted` for the `views`.
 
-    The direction and scale of turns in images that are no `panoramas` yet are unknown.
+    Turns of images that are no `panoramas` yet have an unknown direction and scale. Odometry that
+    repeats `commands` is followed by the robot.
     """
-    impossible = list(_impossible(sources_of(odometry, images, gyro)))
-    check = MotionCheck([], odometry, gyro, list(impossible))
-    if not impossible:
-        for change in parted, _straightened:
-            check.odometry, text = change(check.odometry)
-            check.corrected += [text] if text else []
-    sources = sources_of(check.odometry, images, gyro)
+    check = MotionCheck([], odometry, gyro, [*_impossible(sources_of(odometry, images, gyro))])
+    if not (impossible := bool(check.wrong)):
+        images = _repaired(check, images)
+    sources = sources_of(check.odometry, images, check.gyro)
     pairs = [compare(a, b, what) for what in ('turns', 'way') for a, b in combinations(sources, 2)]
     check.pairs = [pair for pair in pairs if pair]
     turns = check.pair(POSE, IMAGES)
     if images is not None and not panoramas and turns and turns.scale < 0:
-        return check_motion(odometry, (images[0], -images[1]), gyro, panoramas, views)
+        return check_motion(odometry, (images[0], -images[1]), gyro, panoramas, views, commands)
     _judge(check, 'way')
     if not impossible:
         _judge_axes(check)
+        _judge_following(check, sources, commands)
         _judge(check, 'turns')
-        _judge_clocks(check)
+        _judge_clocks(check, images)
         if views is not None:
-            late_ns = round(turns.late_s * 1e9) if turns else 0
-            check.odometry, texts = contradicted(check.odometry, views[0] - late_ns, views[1])
+            clock = check.image_drift or Drift(0, turns.late_s if turns else 0.0, 0.0)
+            taken_ns = views[0] - clock.late_ns(views[0])
+            check.odometry, texts = contradicted(check.odometry, taken_ns, views[1])
             check.corrected += texts
-    if images is not None and not any(IMAGES in (pair.a, pair.b) for pair in check.pairs):
+    of_images = [text for text in check.wrong if text.startswith(IMAGES)]
+    if images is not None and not (of_images or any(IMAGES in (p.a, p.b) for p in check.pairs)):
         check.notes.append('images: too few of them, or turns, to tell whether they are mirrored')
     if not panoramas:
-        check.notes += [text for text in check.wrong if text.startswith('images')]
-        check.wrong = [text for text in check.wrong if not text.startswith('images')]
+        check.notes += of_images
+        check.wrong = [text for text in check.wrong if text not in of_images]
     return check
 
 
@@ -232,6 +256,39 @@ def _judge_axes(check: MotionCheck) -> None:
         text = f'{POSE} drives {sideways:.3g} m sideways and {ahead:.3g} m ahead: correct its '
         text += 'heading and axes (x ahead, y to the left, yaw counterclockwise)'
         (check.wrong if sideways > 2 * SIDEWAYS * ahead else check.notes).append(text)
+
+
+def _repaired(
+    check: MotionCheck, images: tuple[Stamps, Array] | None
+) -> tuple[Stamps, Array] | None:
+    """Correct odometry that jumps or heads aside; stamp the images, and `check.gyro`, by its clock
+    where theirs drifts; leave out faulty samples of the gyroscope.
+    """
+    for change in parted, _straightened:
+        check.odometry, text = change(check.odometry)
+        check.corrected += [text] if text else []
+    drifting = drifts(sources_of(check.odometry, images, check.gyro))
+    check.corrected += drift_sentences(drifting)
+    if check.gyro is not None and GYRO in drifting:
+        stamps_ns = check.gyro.stamps_ns
+        stamps_ns = stamps_ns - drifting[GYRO].late_ns(stamps_ns)
+        check.gyro = replace(check.gyro, stamps_ns=stamps_ns)
+    check.image_drift = drifting.get(IMAGES)
+    if images is not None and check.image_drift is not None:
+        images = images[0] - check.image_drift.late_ns(images[0]), images[1]
+    check.gyro, text = cleaned(check.odometry, images, check.gyro)
+    check.corrected += [text] if text else []
+    return images
+
+
+def _judge_following(check: MotionCheck, sources: Sequence[Source], commands: bool) -> None:
+    """Report images that follow the robot; their turns then show nothing else. The robot itself
+    follows `commands`, which the odometry may repeat.
+    """
+    how = following([one for one in sources if not commands or one.name in (IMAGES, GYRO)])
+    if how:
+        check.wrong.append(f"{IMAGES} follow the robot's turns {how}: {_STABILIZED}")
+        check.pairs = [pair for pair in check.pairs if IMAGES not in (pair.a, pair.b)]
 
 
 def _judge(check: MotionCheck, what: str) -> None:
@@ -317,8 +374,10 @@ def _correct_gyro(check: MotionCheck, kind: str, text: str, factor: float) -> No
         check.gyro = None
 
 
-def _judge_clocks(check: MotionCheck) -> None:
-    """Correct the stamps of the gyroscope; the training corrects those of images."""
+def _judge_clocks(check: MotionCheck, images: tuple[Stamps, Array] | None) -> None:
+    """Correct the stamps of the gyroscope, and leave out one that is worse than none even then; the
+    training corrects the stamps of images.
+    """
     if check.gyro is not None and not check.odometry.trajectory.covers(check.gyro.stamps_ns).any():
         check.corrected.append(f'{GYRO}: stamped by another clock than the odometry; left out')
         check.gyro = None
@@ -332,3 +391,6 @@ def _judge_clocks(check: MotionCheck) -> None:
         if name == GYRO and check.gyro is not None:
             check.gyro = replace(check.gyro, stamps_ns=check.gyro.stamps_ns - late_ns)
         check.corrected.append(f'{name}: stamped {late(pair.late_s)}; taken into account')
+    if is_worse(check.odometry, images, check.gyro):
+        check.corrected.append(f'{GYRO}: left out: the wheels agree better with the images')
+        check.gyro = None

@@ -37,10 +37,11 @@ WHOLE, CERTAIN = 1.15, 0.95
 turn were within 3 %."""
 LATE_S = 0.05
 """Smaller delays are within the period of usual messages."""
+GRID = np.arange(-50, 51) * (CLOCK_RANGE_S / 50)
+"""Delays, s."""
 # Windows are lengthened until half of the motion is in windows with _STEP (rad, m) or more.
 _WINDOWS_S, _STEP, _WINDOWS_MAX = 0.19 * 2.0 ** np.arange(4), 0.1, 3000
 _PAUSE_S = 1.0
-_GRID = np.arange(-50, 51) * (CLOCK_RANGE_S / 50)
 _OUTLIER = 3.0  # times the typical step
 # A delay is certain if the delays that fit nearly as well scatter by less than this, s.
 _STD_MAX_S = 0.06
@@ -170,6 +171,22 @@ def unit(pair: Pair) -> str:
 
 def compare(a: Source, b: Source, what: str = 'turns') -> Pair | None:
     """Compare two sources; None where they measured too little motion at the same time."""
+    chosen = in_windows(a, b, what)
+    if chosen is None:
+        return None
+    slow, fast, windows = chosen
+    # Where `b` is late, it reports later what `a` has reported.
+    delays = (GRID if slow is a else -GRID)[:, None, None]
+    moving = fast.moved(windows + np.round(delays * 1e9).astype(np.int64), what)
+    fixed = np.broadcast_to(slow.moved(windows, what), moving.shape)
+    x, y = (fixed, moving) if slow is a else (moving, fixed)
+    return _regressed(what, a, b, x, y)
+
+
+def in_windows(a: Source, b: Source, what: str) -> tuple[Source, Source, Stamps] | None:
+    """The slower and the faster source, and windows (M, 2) ns between messages of the slower one
+    that are long enough for steps that stand out; None without any.
+    """
     slow, fast = sorted((a, b), key=lambda source: -source.period_s)
     if what not in slow.sums or what not in fast.sums:
         return None
@@ -177,15 +194,9 @@ def compare(a: Source, b: Source, what: str = 'turns') -> Pair | None:
         windows = _windows(slow, fast, length_s)
         if not len(windows):
             return None
-        fixed = slow.moved(windows, what)
-        if _typical(fixed) >= _STEP:
+        if typical(slow.moved(windows, what)) >= _STEP:
             break
-    # Where `b` is late, it reports later what `a` has reported.
-    delays = (_GRID if slow is a else -_GRID)[:, None, None]
-    moving = fast.moved(windows + np.round(delays * 1e9).astype(np.int64), what)
-    fixed = np.broadcast_to(fixed, moving.shape)
-    x, y = (fixed, moving) if slow is a else (moving, fixed)
-    return _regressed(what, a, b, x, y)
+    return slow, fast, windows
 
 
 def _windows(slow: Source, fast: Source, length_s: float) -> Stamps:
@@ -200,19 +211,19 @@ def _windows(slow: Source, fast: Source, length_s: float) -> Stamps:
     return windows[:: len(windows) // _WINDOWS_MAX + 1]
 
 
-def _typical(x: Array) -> float:
+def typical(x: Array) -> float:
     """Half of the motion is in steps as large, or larger ones: standing does not count."""
     return quantile(np.abs(x), 0.5, np.abs(x))
 
 
 def _regressed(what: str, a: Source, b: Source, x: Array, y: Array) -> Pair | None:
     """The best of D delays, of the motion x (D, M) of `a` and y (D, M) of `b` in M windows."""
-    middle = len(_GRID) // 2
+    middle = len(GRID) // 2
     # Noise adds up while nothing moves, and that of images may be large.
     steps = [np.abs(s[middle]) for s, source in ((x, a), (y, b)) if source.name != IMAGES]
     if max(s[s > _STEP / 2].sum() for s in steps) < ENOUGH[what]:
         return None
-    limit = np.array([_typical(x[middle]), _typical(y[middle])])
+    limit = np.array([typical(x[middle]), typical(y[middle])])
     # Shifts between images may err by any angle.
     limit = np.minimum(limit, 2 * limit[::-1]) if IMAGES in (a.name, b.name) else limit
     u, v = (np.clip(s, -_OUTLIER * q, _OUTLIER * q) for s, q in zip((x, y), limit, strict=True))
@@ -220,7 +231,7 @@ def _regressed(what: str, a: Source, b: Source, x: Array, y: Array) -> Pair | No
     for _ in range(2):
         power = (u[:, inlier] ** 2).sum(1) * (v[:, inlier] ** 2).sum(1)
         correlation = np.abs((u * v)[:, inlier].sum(1)) / np.sqrt(np.maximum(power, 1e-30))
-        best = int(np.argmax(correlation - 1e-6 * np.abs(_GRID)))
+        best = int(np.argmax(correlation - 1e-6 * np.abs(GRID)))
         # The least sum of |y - scale x|.
         ratio = y[best] / np.where(x[best] == 0, 1.0, x[best])
         scale = quantile(ratio[inlier], 0.5, np.abs(x[best, inlier]))
@@ -229,11 +240,11 @@ def _regressed(what: str, a: Source, b: Source, x: Array, y: Array) -> Pair | No
         inlier = residual <= max(_OUTLIER * std, limit[1] / 2)
     # Delays whose correlation is within one standard deviation of the best.
     chance = (1 - correlation[best] ** 2) / np.sqrt(max(moves.sum(), 1))
-    as_good = _GRID[correlation >= correlation[best] - chance - 1e-3]
+    as_good = GRID[correlation >= correlation[best] - chance - 1e-3]
     delay_s = None
-    if 0 < best < len(_GRID) - 1 and np.ptp(as_good) / 4 < _STD_MAX_S:
+    if 0 < best < len(GRID) - 1 and np.ptp(as_good) / 4 < _STD_MAX_S:
         peak = float(parabola_peak(*correlation[best - 1 : best + 2]))
-        delay_s = float(_GRID[best] + peak * (_GRID[1] - _GRID[0]))
+        delay_s = float(GRID[best] + peak * (GRID[1] - GRID[0]))
     period_s = max(source.period_s for source in (a, b) if source.name != IMAGES)
     return Pair(what, a.name, b.name, scale, delay_s, float(correlation[best]), period_s)
 

@@ -6,14 +6,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.files import read_regular
+from sfa_localization.data.files import read_text
 from sfa_localization.data.geometry import relative
 from sfa_localization.data.run import POINT_STD_M, Odometry, Points, Run, Stamps
 from sfa_localization.metric.segments import IMAGE_STEP_MIN_M, IMAGE_TURN_MIN_RAD
@@ -40,32 +40,44 @@ def stops(odometry: Odometry) -> Stamps:
 
 
 def points_of(runs: Sequence[Run], path: str) -> Points | None:
-    """The points of a file, whose stops are those of the first run, and of the topics of the runs.
-
-    Raises DataError for an unusable file, and for a stamp outside of the drives.
-    """
-    rows = read_points(Path(path), runs[0].odometry).rows() if path else []
-    drives = [(run.odometry.stamps_ns[0], run.odometry.stamps_ns[-1]) for run in runs]
-    for name, stamp_ns, *_ in rows:
-        if not any(first <= stamp_ns <= last for first, last in drives):
-            times = ', '.join(f'{a * 1e-9:.1f} to {b * 1e-9:.1f} s' for a, b in drives)
-            raise DataError(
-                f'{path}: {name}: outside of the drives ({times}): give the stamp, or '
-                '"stop, number, ..." as inspect numbers them'
-            )
+    """The points of a file, and of the topics of the runs. Raises DataError for a bad file."""
+    rows = read_points(Path(path), [run.odometry for run in runs]).rows() if path else []
     by_topic = [row for run in runs if run.points is not None for row in run.points.rows()]
     rows += by_topic[:: len(by_topic) // MOST + 1]
     return Points.of(rows) if rows else None
 
 
-def read_points(path: Path, odometry: Odometry) -> Points:
-    """Read a file of points. Raises DataError that names the line."""
-    try:
-        lines = read_regular(path, LARGEST_FILE).decode('utf-8-sig').splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f'{path}: cannot be read: {error}') from None
-    stood, rows = stops(odometry).mean(axis=1).astype(np.int64), []
-    for number, line in enumerate(lines, 1):
+def read_points(path: Path, drives: Sequence[Odometry]) -> Points:
+    """Read a file of points, whose stops are those of the first of the drives.
+
+    Raises DataError that names the line, also for a stamp outside of the drives.
+    """
+    stood = stops(drives[0]).mean(axis=1).astype(np.int64).tolist()
+    spans = [(int(drive.stamps_ns[0]), int(drive.stamps_ns[-1])) for drive in drives]
+    rows = []
+    for line, stop, stamp_ns, place, std in list(_lines(path)):  # a wrong form is told first
+        if stop is not None and not 0 < stop <= len(stood):
+            raise DataError(
+                f'{path}: line {line}: no stop {stop}: the first drive stands {len(stood)} times '
+                f'for {STOP_S:g} s; inspect lists them'
+            )
+        name = f'stop {stop}' if stop else f'point of {stamp_ns * 1e-9:.10g} s'
+        stamp_ns = stood[stop - 1] if stop else stamp_ns
+        if not any(first <= stamp_ns <= last for first, last in spans):
+            times = ', '.join(f'{a * 1e-9:.1f} to {b * 1e-9:.1f} s' for a, b in spans)
+            raise DataError(
+                f'{path}: line {line}: {name}: outside of the drives ({times}): give the stamp, or '
+                '"stop, number, ..." as inspect numbers them'
+            )
+        rows.append((name, stamp_ns, place, std, 0j))
+    if not rows:
+        raise DataError(f'{path}: holds no points: {_USAGE}')
+    return Points.of(rows)
+
+
+def _lines(path: Path) -> Iterator[tuple[int, int | None, int, complex, float]]:
+    """Number, stop or None, stamp, place and standard deviation of each line with a point."""
+    for number, line in enumerate(read_text(path, LARGEST_FILE, DataError).splitlines(), 1):
         cells = re.split(r'\s*[,;]\s*|\s+', line.partition('#')[0].strip())
         if cells == [''] or cells[0] == 'stamp_s':
             continue
@@ -74,16 +86,7 @@ def read_points(path: Path, odometry: Odometry) -> Points:
             stamp_ns = 0 if stop is not None else int(Decimal(cells[0]) * 10**9)
             x, y, std = map(float, [*cells[1:], str(POINT_STD_M)][:3])
         except (ArithmeticError, ValueError, IndexError):
-            stamp_ns, x, y, std = 0, math.nan, math.nan, math.nan
+            stop, stamp_ns, x, y, std = None, 0, math.nan, math.nan, math.nan
         if not (math.isfinite(x + y) and 0 < std < math.inf and len(cells) <= 4):
             raise DataError(f'{path}: line {number}: {line.strip()!r} is no point: {_USAGE}')
-        if stop is not None and not 0 < stop <= len(stood):
-            raise DataError(
-                f'{path}: line {number}: no stop {stop}: the first drive stands {len(stood)} times '
-                f'for {STOP_S:g} s; inspect lists them'
-            )
-        name = f'stop {stop}' if stop else f'point of {cells[0]} s'
-        rows.append((name, int(stood[stop - 1]) if stop else stamp_ns, complex(x, y), std))
-    if not rows:
-        raise DataError(f'{path}: holds no points: {_USAGE}')
-    return Points.of(rows)
+        yield number, stop, stamp_ns, complex(x, y), std

@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.data.settings import Settings, setting
+from sfa_localization.data.settings import Settings, require_pose, setting
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,16 @@ class MetricConfig(Settings):
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
-        if len(self.start_pose) not in (0, 3):
-            raise ConfigError(f'start_pose: {self.start_pose} is not empty, and not x, y, yaw')
+        require_pose('start_pose', self.start_pose)
         if len(self.camera_xy) not in (0, 2):
             raise ConfigError(f'camera_xy: {self.camera_xy} is not empty, and not ahead, left')
+
+
+@dataclass(frozen=True, slots=True)
+class GroundConfig(Settings):
+    """The driven ground as a map of cells; by default lanes that are 1 m apart join."""
+
+    width: float = setting(
+        1.0, 'width of the robot with its margin', unit='m', low=0.05, high=100.0
+    )
+    cell: float = setting(0.05, 'size of a cell', unit='m', low=0.01, high=10.0)

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages to and from plain values; malformed ones raise MessageError, images CameraError.
+"""ROS messages to and from plain values; malformed ones raise MessageError.
 
 Messages are filled here and nowhere else; `data.messages` reads their fields. Stamps are integer
 nanoseconds, poses are (x m, y m, yaw rad), covariances of poses are (3, 3) in that order.
@@ -17,13 +17,14 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs import msg as geometry
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import MapMetaData, OccupancyGrid, Odometry
 from numpy.typing import ArrayLike
 from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
-from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
+from std_msgs.msg import ColorRGBA, Float64MultiArray, Header, MultiArrayDimension, String
+from visualization_msgs.msg import Marker, MarkerArray
 
-from sfa_localization.camera.encodings import encode_jpeg, read_compressed, read_raw
+from sfa_localization.camera.encodings import encode_jpeg
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data import messages
 from sfa_localization.data.error_correlation import ErrorCorrelation
@@ -32,11 +33,15 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import NANOSECONDS, read_stamp, require_sane
 from sfa_localization.data.rig import Rig
 from sfa_localization.data.run import Image
+from sfa_localization.metric.driven_ground import Cells, DrivenGround
 
 _FIXED = np.diag([1e-6] * 6)
 """Covariance of z, roll and pitch, which a planar estimate fixes."""
 _PLANAR, _TWIST = np.ix_([0, 1, 5], [0, 1, 5]), np.ix_([0, 5], [0, 5])
 _CORRELATION = 'error_correlation'
+_FREE, _UNKNOWN = 0, -1
+_RED_M, _LINE_M = 0.3, 0.05
+"""The expected error that is drawn red, and the width of the lines."""
 
 
 def to_stamp(stamp_ns: int) -> Time:
@@ -48,12 +53,6 @@ def to_stamp(stamp_ns: int) -> Time:
 def to_quaternion(yaw_rad: float) -> geometry.Quaternion:
     """Rotation about the vertical."""
     return geometry.Quaternion(z=math.sin(yaw_rad / 2), w=math.cos(yaw_rad / 2))
-
-
-def read_image(message: ImageMessage | CompressedImage) -> tuple[int, Image]:
-    """Stamp and image (H, W, 3) uint8 BGR of either image message."""
-    read = read_compressed if isinstance(message, CompressedImage) else read_raw
-    return read_stamp(message.header.stamp), read(message)
 
 
 def to_image(image: Image, stamp_ns: int, frame: str) -> ImageMessage:
@@ -86,10 +85,14 @@ def read_info(message: String) -> PanoramaConfig:
         raise MessageError(str(error)) from None
 
 
-def read_odometry(message: Odometry) -> tuple[int, tuple[float, ...], tuple[float, float, float]]:
-    """Stamp, twist (v m/s, omega rad/s, and their variances, 0 if unknown) and odometry's pose."""
-    pose = messages.read_planar(message.pose.pose.position, message.pose.pose.orientation)
-    return read_stamp(message.header.stamp), messages.read_twist(message), pose
+def read_odometry(
+    message: Odometry,
+) -> tuple[int, tuple[float, ...], tuple[float, float, float] | None]:
+    """Stamp, twist (v m/s, omega rad/s, and their variances, 0 if unknown) and odometry's pose;
+    None where it is not filled.
+    """
+    pose, twist = messages.read_odometry(message)
+    return read_stamp(message.header.stamp), twist, pose
 
 
 def read_pose(message: geometry.PoseWithCovarianceStamped) -> tuple[int, Array, Array]:
@@ -169,6 +172,27 @@ def to_turned(yaw_rad: float, stamp_ns: int, frame: str) -> geometry.QuaternionS
 def read_turned(message: geometry.QuaternionStamped) -> tuple[int, float]:
     """Stamp ns and yaw rad. Raises MessageError."""
     return read_stamp(message.header.stamp), messages.read_yaw(message.quaternion)
+
+
+def to_grid(cells: Cells, stamp_ns: int, frame: str) -> OccupancyGrid:
+    """Cells as a map: free where the robot drove, else unknown."""
+    info = MapMetaData(map_load_time=to_stamp(stamp_ns), resolution=cells.size_m)
+    info.height, info.width = cells.driven.shape
+    info.origin.position.x, info.origin.position.y = cells.corner.tolist()
+    values = np.where(cells.driven, _FREE, _UNKNOWN).astype(np.int8)
+    data = array.array('b', values.tobytes())
+    return OccupancyGrid(header=_header(stamp_ns, frame), info=info, data=data)
+
+
+def to_lines(ground: DrivenGround, stamp_ns: int, frame: str) -> MarkerArray:
+    """The paths of the training as lines: green where one image hardly errs, red from _RED_M on."""
+    marker = Marker(header=_header(stamp_ns, frame), ns='driven', type=Marker.LINE_LIST)
+    marker.scale.x, marker.pose.orientation.w = _LINE_M, 1.0
+    ends = ground.lines.ravel()
+    marker.points = [geometry.Point(x=x, y=y) for x, y in ground.places[ends].tolist()]
+    red = np.minimum(ground.expected_m[ends] / _RED_M, 1.0)
+    marker.colors = [ColorRGBA(r=share, g=1.0 - share, a=1.0) for share in red.tolist()]
+    return MarkerArray(markers=[marker])
 
 
 def to_rig(rig: Rig, correlation: ErrorCorrelation) -> String:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,12 +13,13 @@ from sfa_localization.nodes.monitor import steady_s
 
 PATIENCE_S = 3.0
 """Time before another topic is taken: drivers of cameras and wheels may start after this node."""
+_TRANSPORT = re.compile('/(compressed|ffmpeg|foxglove)$')
 _OUTPUTS = '/ekf/odometry', '/panorama', '/panorama/compressed'
 """Odometry and images of this package's nodes, which a bag may hold: never an input."""
 
 
 class Discovery:
-    """Looks for topics of the types `kinds`, of which the first is that of the input `topic`.
+    """Looks for topics of `types`, of which the first is that of the input `topic`.
 
     `arguments` of the launch file choose another topic: the first is the input's. `take` is called
     with the only topic that qualifies, unless the input was remapped, and with the input's own
@@ -28,12 +30,11 @@ class Discovery:
         self,
         node: Any,
         topic: str,
-        kinds: Sequence[Any],
+        types: Sequence[str],
         arguments: Sequence[str],
         take: Callable[[str], None] | None = None,
     ) -> None:
-        self._node, self._topic, self._arguments = node, topic, arguments
-        self._types = [f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}' for kind in kinds]
+        self._node, self._topic, self._arguments, self._types = node, topic, arguments, types
         self._start_s = steady_s()
         self._expected = node.resolve_topic_name(topic)
         remapped = self._expected != node.resolve_topic_name(topic, only_expand=True)
@@ -61,14 +62,14 @@ class Discovery:
             (name, kind)
             for kind in self._types
             for name, kinds in sorted(self._node.get_topic_names_and_types())
-            if kind in kinds and self._publishers(name) - this_node
+            if kind in kinds and self._publishers(name) - this_node and self._is_offered(name)
         ]
         usable = [n for n, kind in topics if kind == self._types[0] and self._qualifies(n)]
         if self._take is not None and len(usable) == 1:
             self._has_substitute, self.hint = True, ''
             self._node.get_logger().warning(
                 f'nobody publishes on {self._expected}: taking {usable[0]}, the only '
-                f'{self._types[0]}; {self._arguments[0]}:={usable[0].removesuffix("/compressed")} '
+                f'{self._types[0]}; {self._arguments[0]}:={_TRANSPORT.sub("", usable[0])} '
                 'makes this permanent'
             )
             self._take(usable[0])
@@ -86,8 +87,15 @@ class Discovery:
         spaces = {f'{space}/' for _, space in self._node.get_node_names_and_namespaces()}
         others = tuple(space for space in spaces if len(space) > len(below))
         usual = name.startswith(below) and not name.startswith(others)
+        return usual and not self._is_output(name)
+
+    def _is_offered(self, name: str) -> bool:
+        """Whether an argument of the launch file takes a topic: panoramas are also an input."""
+        return 'panorama' in self._arguments or not self._is_output(name)
+
+    def _is_output(self, name: str) -> bool:
         ours = {node for node, _ in self._publishers(name)} & {*NODES, self._node.get_name()}
-        return usual and not name.endswith(_OUTPUTS) and not ours
+        return bool(ours) or name.endswith(_OUTPUTS)
 
     def _publishers(self, name: str) -> set[tuple[str, str]]:
         infos = self._node.get_publishers_info_by_topic(name)

@@ -17,9 +17,10 @@ from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Empty, SetBool, Trigger
 
 from sfa_localization.data.errors import MessageError
+from sfa_localization.data.files import require_outputs
 from sfa_localization.data.geometry import Array, compose, invert
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.belief import Pose
@@ -37,6 +38,10 @@ try:
     from tf2_msgs.msg import TFMessage
 except ImportError:  # the pip wheels of ROS have none
     TFMessage = None
+try:
+    from nav2_msgs.srv import SetInitialPose
+except ImportError:  # without Nav2 nobody calls it
+    SetInitialPose = None
 
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 _LEVELS = dict(zip(Level, (_WARN, _OK, _WARN, _ERROR), strict=True))
@@ -46,10 +51,11 @@ IMAGES_SILENCE = 3.0
 """Images may be silent this many times longer than odometry, because they come less often."""
 _WATCH_PERIOD_S = 0.2
 _BACKLOG_S = 0.2  # odometry that waited for longer is fused, but not published each time
-_BEHIND_LOG_S = 60.0  # between warnings in the log that this node is behind
+_LOG_S = 60.0  # between equal warnings in the log
 _REPEAT_STATE_S = 0.9  # between states of the same level with other reasons
 _OFF_GRID_NS = 500  # added to transforms of the future: tf2 rejects a stamp that it has already
 _BACKWARD_JUMP_NS = -500_000_000  # of simulated time; less is jitter
+NO_POSE = 'its pose is not filled: only the twist is used, and map -> odom is not published'
 _ODOM, _IMAGE_POSE = 'odom', 'sfa/pose_with_covariance'
 
 
@@ -76,10 +82,14 @@ class EkfNode(LocalizationNode):
 
     def setup(self) -> None:
         self._begin()
+        if self._config.pose_file:
+            self.attempt('pose_file', require_outputs, [FilePath(self._config.pose_file)], [])
         self.attempt('pose_file', self._restore_pose)
         self._make_publishers()
         self._subscribe_odometry()
-        self.discovery = Discovery(self, _ODOM, [Odometry], ['odom'], self._subscribe_odometry)
+        self.discovery = Discovery(
+            self, _ODOM, ['nav_msgs/msg/Odometry'], ['odom'], self._subscribe_odometry
+        )
         pose = geometry.PoseWithCovarianceStamped
         self.subscribe(pose, _IMAGE_POSE, self._receive_pose, sensor_qos(20))
         self.subscribe(
@@ -93,6 +103,11 @@ class EkfNode(LocalizationNode):
             self.subscribe(pose, topic, self._set_pose, QoSProfile(depth=1))
         self.service(Trigger, '~/reset', self._reset)
         self.service(SetBool, '~/pause', self._pause)
+        # The services of nav2_amcl, by its names.
+        self.order(Empty, 'reinitialize_global_localization', self._forget_pose)
+        if SetInitialPose is not None:
+            take_pose = self._set_pose
+            self.order(SetInitialPose, 'set_initial_pose', lambda given: take_pose(given.pose))
         self.every(_WATCH_PERIOD_S, self._publish_state)
         self.every(SAVE_PERIOD_S, self._save_pose)
         # A bag played in a loop steps simulated time back, before the stamps of messages do.
@@ -146,6 +161,8 @@ class EkfNode(LocalizationNode):
         reason = self.filter.add_odometry(stamp_ns, v, omega, noise, pose)
         if reason:
             raise MessageError(reason)
+        if pose is None:
+            self.get_logger().warning(f'{self.full_name(_ODOM)}: {NO_POSE}', once=True)
         now_s = steady_s()
         if self.monitors[_ODOM].waited_s > _BACKLOG_S > now_s - self._published_s:
             return
@@ -153,7 +170,8 @@ class EkfNode(LocalizationNode):
         state = self.filter.at(stamp_ns)
         if state is not None:
             self._publish_odometry(state)
-            self._publish_transform(state, pose)
+            if pose is not None:
+                self._publish_transform(state, pose)
             self._extend_path(state)
 
     def _receive_pose(self, message: geometry.PoseWithCovarianceStamped) -> None:
@@ -165,7 +183,7 @@ class EkfNode(LocalizationNode):
             covariance[2, 2] = math.inf  # a source without heading leaves its variance 0
         update = self.filter.add_measurement(stamp_ns, pose, covariance)
         self._publish_verdict(update)
-        self._publish_pose(stamp_ns)
+        self._publish_pose(update.stamp_ns)
         if not update.accepted:
             raise MessageError(update.reason)
 
@@ -197,6 +215,12 @@ class EkfNode(LocalizationNode):
         self._publish_state()
         response.success, response.message = True, self.status().level.name
         return response
+
+    def _forget_pose(self, _: Any) -> None:
+        self.filter.forget_pose()
+        self._reliable = None
+        self.get_logger().info('pose forgotten: images show where the robot is')
+        self._publish_state()
 
     def _pause(self, request: Any, response: Any) -> Any:
         self._paused = bool(request.data)
@@ -298,12 +322,16 @@ class EkfNode(LocalizationNode):
                 reasons.append(f'nobody publishes on {name}')
             elif limit < silent < math.inf:
                 reasons.append(f'nothing on {name} for {silent:.0f} s')
+        name = self.full_name(_ODOM)
+        if self.filter.odometry_in_turn and self.count_publishers(name) > 1:
+            reasons.append(f'two publishers on {name}: stop one, or take another topic by odom:=')
+            self.get_logger().warning(reasons[-1], throttle_duration_sec=_LOG_S)
         if self._paused:
             reasons.append('paused: images are not fused')
         lost, behind_s = [], self._behind_s()
         if behind_s > timeout_s:
             reasons.append(f'behind by {behind_s:.1f} s: this computer is too busy')
-            self.get_logger().warning(reasons[-1], throttle_duration_sec=_BEHIND_LOG_S)
+            self.get_logger().warning(reasons[-1], throttle_duration_sec=_LOG_S)
         elif by_now is not None and (reasons or status.level is Level.DEGRADED):
             # The filter knows the stamps of messages only; by the wall clock it may be lost.
             lost = [f'{reason} by now' for reason in uncertainty(by_now, self.filter.config)]

@@ -122,11 +122,13 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         callback: Callable[[Any], None],
         qos: QoSProfile,
         substitute: str = '',
+        entity: str | None = None,
     ) -> Any:
         """A subscription that counts messages, and those which `callback` rejects, under `topic`.
 
         An inactive node drops messages, except latched ones, which come only once. The topic
-        `substitute`, if given, is subscribed to in place of `topic`.
+        `substitute`, if given, is subscribed to in place of `topic`. Subscriptions of another
+        `entity` have their own qos_overrides.
         """
         latched = qos.durability is DurabilityPolicy.TRANSIENT_LOCAL
         self.require_input(topic, substitute)
@@ -140,7 +142,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             substitute or topic,
             cast(Any, receive),
             qos,
-            qos_overriding_options=_QOS_PARAMETERS,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(entity_id=entity),
         )
         self._entities[subscription] = self.destroy_subscription
         return subscription
@@ -191,6 +193,19 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
                 response.message = str(error)
             except Exception as error:
                 self.defect(name, error)
+            return response
+
+        service = self.create_service(kind, name, answer)
+        self._entities[service] = self.destroy_service
+
+    def order(self, kind: Any, name: str, callback: Callable[[Any], None]) -> None:
+        """A service with an empty answer: a request is counted, and rejected, as a message is."""
+
+        def answer(request: Any, response: Any) -> Any:
+            if self.active:
+                self.take(name, callback, request)
+            else:
+                self.refuse(name, 'this node is not active')
             return response
 
         service = self.create_service(kind, name, answer)

@@ -17,7 +17,7 @@ from sensor_msgs.msg import CompressedImage, Imu
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import String
 
-from sfa_localization.camera.capture import Feed, opener
+from sfa_localization.camera.capture import Feed, FeedStatus, opener
 from sfa_localization.camera.leveling import leveled, tilts_at
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, CaptureConfig, PanoramaConfig
@@ -29,6 +29,7 @@ from sfa_localization.data.settings import Settings
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes import lifecycle
 from sfa_localization.nodes.discovery import Discovery
+from sfa_localization.nodes.image_input import ImageInput
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import OmnicamNodeConfig
@@ -56,8 +57,9 @@ class OmnicamNode(lifecycle.LocalizationNode):
 
     def _begin(self) -> None:
         self._feed: Feed | None = None
-        self._subscription: Any = None
+        self._losses = 0
         self._listening_since_s: float | None = None
+        self._images: ImageInput | None = None
         self._newest: deque[tuple[int, Image]] = deque(maxlen=1)
         self._tilts: deque[tuple[int, float, float]] = deque(maxlen=_ORIENTATIONS)
         self._is_level = True
@@ -65,23 +67,24 @@ class OmnicamNode(lifecycle.LocalizationNode):
     # Life cycle.
 
     def setup(self) -> None:
-        self._build_tables(self._unwrapper)
+        self._unwrapper.check(self._size)
         self._frozen = FrozenWatch()
         self._panoramas = self.publisher(ImageMessage, 'panorama', 2)
         compressed = self.following('panorama/compressed')
         self._compressed = self.publisher(CompressedImage, compressed, 2)
         info = self.following('panorama/info')
         self._info = self.publisher(String, info, lifecycle.latched_qos())
-        raw = self._config.image_transport == 'raw'
-        self._input = 'image_raw' if raw else self.following('image_raw/compressed')
+        transport = self._config.image_transport
+        raw = transport == 'raw'
+        self._input = 'image_raw' if raw else self.following(f'image_raw/{transport}')
         self.discovery: Discovery | None = None
         self._substitute = ''
         capture = self.settings(CaptureConfig)
         if capture.source == 'topic':
             self.require_input(self._input)
-            self._kinds = [ImageMessage, CompressedImage][:: 1 if raw else -1]
-            arguments = 'image', 'panorama'
-            self.discovery = Discovery(self, self._input, self._kinds, arguments, self._take)
+            self._images = ImageInput(self, transport, self._input, self._publish)
+            types, arguments = self._images.types, ('image', 'panorama')
+            self.discovery = Discovery(self, self._input, types, arguments, self._take)
         else:
             self._input = capture.source_path
             self._arrival = self.create_guard_condition(self._arrived)
@@ -110,15 +113,18 @@ class OmnicamNode(lifecycle.LocalizationNode):
 
     def _follow_demand(self) -> None:
         if self._feed is not None:
-            self._feed.check()
+            self._report_loss(self._feed.check())
         elif not self._wanted():
             self._stop_listening()
-        elif self._listening_since_s is None:
+        elif self._listening_since_s is None and self._images is not None:
             self._listening_since_s = steady_s()
-            kind, qos = self._kinds[0], lifecycle.sensor_qos(1)
-            self._subscription = self.subscribe(
-                kind, self._input, self._use_message, qos, self._substitute
-            )
+            self._images.start(self._substitute)
+
+    def _report_loss(self, status: FeedStatus) -> None:
+        """Log and count each time that the source could not be opened, or was lost."""
+        if status.lost > self._losses:
+            self._losses = status.lost
+            self._reject(f'{"lost" if self._size else "cannot open"}: {status.problem}')
 
     def _take(self, topic: str) -> None:
         """Take images from a substitute for the input's topic, or again from that itself."""
@@ -127,12 +133,9 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._substitute = topic
 
     def _stop_listening(self) -> None:
-        self.unsubscribe(self._subscription)
-        self._subscription = self._listening_since_s = None
-
-    def _use_message(self, message: ImageMessage | CompressedImage) -> None:
-        stamp_ns, image = convert.read_image(message)
-        self._publish(image, stamp_ns, self._config.frame_id or message.header.frame_id)
+        if self._images is not None:
+            self._images.stop()
+        self._listening_since_s = None
 
     def _deliver(self, image: Image) -> None:
         """Keep the newest image, and wake the executor; called by the feed's thread."""
@@ -150,7 +153,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         stamp_ns, image = delivered
         if stamp_ns <= 0:
             raise MessageError('the clock has not started')
-        self._publish(image, stamp_ns, self._config.frame_id)
+        self._publish(stamp_ns, image, '')
 
     def _take_orientation(self, message: Imu) -> None:
         stamp_ns, tilt = read_stamp(message.header.stamp), read_tilt(message)
@@ -169,8 +172,9 @@ class OmnicamNode(lifecycle.LocalizationNode):
         sphere = self.settings(PanoramaConfig).sphere
         return leveled(panorama, tilt, sphere) if self._is_level else panorama
 
-    def _publish(self, image: Image, stamp_ns: int, frame: str) -> None:
-        panorama, frame = self._leveled(self._unwrapper(image), stamp_ns), frame or 'omnicam'
+    def _publish(self, stamp_ns: int, image: Image, frame: str) -> None:
+        panorama = self._leveled(self._unwrapper(image), stamp_ns)
+        frame = self._config.frame_id or frame or 'omnicam'
         self._size = (image.shape[0], image.shape[1])
         if self._panoramas.get_subscription_count():
             self._panoramas.publish(convert.to_image(panorama, stamp_ns, frame))
@@ -184,7 +188,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def check(self, settings: Current) -> None:
         """Raises LocalizationError for a mask, sector, mount or elevation that hides all."""
         if any(settings[kind] != self._settings[kind] for kind in (CameraConfig, PanoramaConfig)):
-            self._build_tables(self._new_unwrapper(settings))
+            self._new_unwrapper(settings).check(self._size)
 
     def settings_changed(self, settings: Settings) -> None:
         if isinstance(settings, CaptureConfig) and self._feed is not None:
@@ -198,13 +202,6 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def _new_unwrapper(settings: Current) -> Unwrapper:
         camera, panorama = settings[CameraConfig], settings[PanoramaConfig]
         return Unwrapper(cast(CameraConfig, camera), cast(PanoramaConfig, panorama))
-
-    def _build_tables(self, unwrapper: Unwrapper) -> None:
-        """Build the tables for the images' size, if an image or the calibration gives it."""
-        lens = unwrapper.calibration if unwrapper.model else None
-        size = self._size or (lens and (lens.image_height, lens.image_width)) or (0, 0)
-        if lens and 0 not in size:
-            unwrapper.visible(size)
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         details = {'camera model': self._unwrapper.model}
@@ -239,9 +236,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
             return _WARN, f'the camera has repeated its last image for {frozen_s:.0f} s'
         if monitor.received and not monitor.used:
             return _ERROR, 'no image could be used so far'
-        visible = 1.0
-        if self._size is not None and not self._unwrapper.is_panorama(self._size):
-            visible = float(self._unwrapper.visible(self._size).mean())
+        visible = 1.0 if self._size is None else self._unwrapper.visible(self._size).mean()
         details['panorama visible [%]'] = f'{100 * visible:.0f}'
         if visible < _LITTLE_VISIBLE:
             return _WARN, f'the camera sees only {100 * visible:.0f} % of the panorama'

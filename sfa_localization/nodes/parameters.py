@@ -26,6 +26,7 @@ from sfa_localization.data.settings import Settings, nearest
 S = TypeVar('S', bound=Settings)
 Current = dict[type[Settings], Settings]
 """The settings in force, by their class."""
+_CLOCK = 'use_sim_time'  # a parameter of each node that is not read-only
 
 
 def declare(node: Node, kinds: Sequence[type[Settings]]) -> Current:
@@ -57,7 +58,9 @@ def on_change(
     fields = {item.name: item for kind in current for item in dataclasses.fields(kind)}
 
     def convert(changes: list[Parameter]) -> list[Parameter]:
-        return [_typed(fields[c.name], c) if c.name in fields else c for c in changes]
+        typed = [_typed(fields[c.name], c) if c.name in fields else c for c in changes]
+        # ROS refuses an empty list too.
+        return [c for c in typed if not _repeats_fixed(node, c)] or [node.get_parameter(_CLOCK)]
 
     def judge(changes: list[Parameter]) -> SetParametersResult:
         try:
@@ -75,6 +78,14 @@ def on_change(
     node.add_pre_set_parameters_callback(convert)
     node.add_on_set_parameters_callback(judge)
     node.add_post_set_parameters_callback(accept)
+
+
+def _repeats_fixed(node: Node, change: Parameter) -> bool:
+    """Whether a read-only parameter gets the value it has, as by `ros2 param load` of a dump."""
+    if not (node.has_parameter(change.name) and node.describe_parameter(change.name).read_only):
+        return False
+    now = node.get_parameter(change.name)
+    return bool(change.get_parameter_value() == now.get_parameter_value())
 
 
 def _changed(settings: S, changes: Sequence[Parameter]) -> S:

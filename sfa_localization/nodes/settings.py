@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.settings import Settings, setting
 
+_TRANSPORTS = 'raw', 'compressed', 'ffmpeg', 'foxglove'
+
 
 @dataclass(frozen=True, slots=True)
 class NodeConfig(Settings):
@@ -21,9 +23,7 @@ class NodeConfig(Settings):
 class OmnicamNodeConfig(Settings):
     """omnicam_node: camera images in, panoramas out."""
 
-    image_transport: str = setting(
-        'raw', 'which topic to take images from', choices=('raw', 'compressed')
-    )
+    image_transport: str = setting('raw', 'which topic to take images from', choices=_TRANSPORTS)
     frame_id: str = setting('', "frame of the panoramas; empty: the image's own, or omnicam")
 
 
@@ -34,7 +34,7 @@ class SfaNodeConfig(Settings):
     model: str = setting('', 'file of the trained model', live=True)
     map_frame: str = setting('map', 'frame of the poses')
     image_transport: str = setting(
-        'raw', 'listen to panorama, or to panorama/compressed', choices=('raw', 'compressed')
+        'raw', 'listen to panorama, or to panorama/compressed and so on', choices=_TRANSPORTS
     )
     silence_timeout: float = setting(
         2.0, 'time without panoramas that is an error', unit='s', low=0.1, high=3600.0, live=True

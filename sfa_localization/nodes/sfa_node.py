@@ -5,24 +5,30 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, QuaternionStamped
-from sensor_msgs.msg import CompressedImage, Image
+from nav_msgs.msg import OccupancyGrid
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
 
-from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
+from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig, WatchConfig
 from sfa_localization.camera.watch import EXPLAINED_WARNING
 from sfa_localization.data.errors import ConfigError, MessageError
+from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.camera_clock import NEAR_NS
+from sfa_localization.metric.settings import GroundConfig
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.discovery import Discovery
-from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, sensor_qos
+from sfa_localization.nodes.image_input import ImageInput
+from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos
 from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import SfaNodeConfig
 from sfa_localization.observer import Observation, Observer
@@ -51,20 +57,21 @@ class SfaNode(LocalizationNode):
         self._uncertain = self.publisher(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
         latched = latched_qos()
         self._rig = self.publisher(String, 'sfa/rig', latched)
+        self._map = self.publisher(OccupancyGrid, 'sfa/map', latched)
+        self._paths = self.publisher(MarkerArray, 'sfa/map_paths', latched)
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
         self._declared: PanoramaConfig | None = None
         self._info = self.following('panorama/info')
         self.subscribe(String, self._info, self._receive_info, latched)
-        compressed = self._config.image_transport == 'compressed'
-        self._topic = self.following('panorama/compressed') if compressed else 'panorama'
-        kinds = [CompressedImage, Image] if compressed else [Image, CompressedImage]
-        # With depth 1 the oldest image is dropped when images come faster than they are located.
-        self.subscribe(kinds[0], self._topic, self._receive, sensor_qos(1))
-        self.discovery = Discovery(self, self._topic, kinds, ['panorama'])
+        transport = self._config.image_transport
+        self._topic = 'panorama' if transport == 'raw' else self.following(f'panorama/{transport}')
+        images = ImageInput(self, transport, self._topic, self._locate)
+        images.start()
+        self.discovery = Discovery(self, self._topic, images.types, ['panorama'])
 
     def started(self) -> None:
-        self._publish_rig()
+        self._publish_map()
 
     def teardown(self) -> None:
         self._observer = None
@@ -97,18 +104,21 @@ class SfaNode(LocalizationNode):
         """Switch to another model; an unconfigured node loads its model when configured."""
         if self._observer is not None:
             self._observer.use(model)
-            self._publish_rig()
+            self._publish_map()
 
     def _reload(self, _: Any, response: Any) -> Any:
         self._use(self._load(self._config.model))
         response.success, response.message = True, f'loaded {self._config.model}'
         return response
 
-    def _publish_rig(self) -> None:
-        """Publish what ekf_node needs to know of the model."""
+    def _publish_map(self) -> None:
+        """Publish where the robot drove in training, and what ekf_node needs to know."""
         assert self._observer is not None
-        model = self._observer.model
+        model, frame = self._observer.model, self._config.map_frame
+        now_ns = self.get_clock().now().nanoseconds
         self._rig.publish(convert.to_rig(model.rig, model.error_correlation))
+        self._map.publish(convert.to_grid(model.ground.cells(GroundConfig()), now_ns, frame))
+        self._paths.publish(convert.to_lines(model.ground, now_ns, frame))
 
     def _receive_info(self, message: String) -> None:
         self._declared = convert.read_info(message)
@@ -123,14 +133,24 @@ class SfaNode(LocalizationNode):
             'set these parameters of omnicam_node'
         )
 
-    def _receive(self, message: Image | CompressedImage) -> None:
+    def _locate(self, stamp_ns: int, image: Image, _: str) -> None:
         assert self._observer is not None
         if problem := self._declared_problem(self._observer.model.panorama):
             raise MessageError(problem)
-        self._last = observation = self._observer.observe(*convert.read_image(message))
+        image = self._mounted(image, self._observer.model)
+        self._last = observation = self._observer.observe(stamp_ns, image)
         self._publish(observation)
         if observation.problem:
             raise MessageError(observation.problem)
+
+    def _mounted(self, image: Image, model: PlaceModel) -> Image:
+        """An image of a camera, resampled as in training; omnicam_node, which declares its
+        panoramas, has done so.
+        """
+        expected = image.shape[:2] == (model.panorama.height, model.panorama.width)
+        if self._declared is not None or not (model.mount_rpy and expected):
+            return image
+        return _unwrapper(model.mount_rpy, model.panorama)(image)
 
     def _publish(self, seen: Observation) -> None:
         """Publish an observation; a pose of an unusable image only with its large covariance."""
@@ -168,6 +188,11 @@ class SfaNode(LocalizationNode):
         if explained < EXPLAINED_WARNING:
             return _WARN, 'images are unlike those of training', values
         return _OK, 'locating', values
+
+
+@lru_cache(maxsize=1)
+def _unwrapper(mount_rpy: tuple[float, ...], panorama: PanoramaConfig) -> Unwrapper:
+    return Unwrapper(CameraConfig(mount_rpy=mount_rpy), panorama)
 
 
 def _feature_pose(slow: Any, stamp_ns: int) -> PoseStamped:

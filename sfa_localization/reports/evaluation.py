@@ -8,6 +8,7 @@ color-blind readers.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -84,7 +85,8 @@ def errors_of(truth: Trajectory, estimate: Trajectory) -> Errors:
 
 def tables(scores: Scores) -> str:
     """Position and heading errors as Markdown tables."""
-    return '\n\n'.join(_markdown(*rows(scores)) for rows in (_position_rows, _heading_rows))
+    both = _position_rows(scores), _heading_rows(scores)
+    return '\n\n'.join(_markdown(head, rows) for head, rows in both if rows)
 
 
 def _position_rows(scores: Scores) -> tuple[list[str], list[list[str]]]:
@@ -275,20 +277,23 @@ def write_evaluation_page(
     scores: Scores,
     counts: Mapping[str, Any],
     samples: Mapping[WorstImage, Image],
+    notes: Sequence[str] = (),
 ) -> None:
     """Write `folder`/index.html with the figures of `write_report` and an error map.
 
-    `counts` are those of Evaluation, `samples` the worst images. Raises LocalizationError.
+    `counts` are those of Evaluation, `samples` the worst images, `notes` tell what the truth is.
+    Raises LocalizationError.
     """
     error_map_figure(folder / 'error_map.png', truth, estimates['ekf'])
     if samples:
         write_worst_images(folder / 'worst_images.png', samples)
+    headings = _heading_rows(scores)
     page.write_page(
         folder,
         title,
         page.verdict(*judgment(scores, counts)),
         page.section('How far off?', page.table(*_position_rows(scores)),
-                     page.table(*_heading_rows(scores)),
+                     page.table(*headings) if headings[1] else '', page.items(notes),
                      page.figure(folder / 'overview.png', 'Estimated and true paths, slow features '
                                  'where the images seem to be taken, and errors')),
         page.section('Where is it weak?', page.items([*_weak_lines(truth, estimates['ekf'])]),
@@ -314,16 +319,23 @@ def judgment(scores: Scores, counts: Mapping[str, Any]) -> tuple[str, str]:
             page.WEAK,
             f'The mean error is {mean:.2f} m, more than that of the wheels alone.',
         )
-    share = scores['ekf'].get('within_95')
+    trust, sound = _trust(scores['ekf'])
+    return page.GOOD if sound else page.WEAK, f'The mean error is {mean:.2f} m, {trust}'
+
+
+def _trust(row: Mapping[str, Any]) -> tuple[str, bool]:
+    """Whether the squared errors of an estimate are as its covariances say, in words, and whether
+    these are large enough.
+    """
+    share, ratio, expected = row.get('within_95'), row.get('nees'), row.get('nees_right')
     if share is not None and share < TRUSTED_SHARE:
-        return (
-            page.WEAK,
-            f'The mean error is {mean:.2f} m, but the covariances are too small.',
-        )
-    return (
-        page.GOOD,
-        f'The mean error is {mean:.2f} m, and the covariances are right.',
-    )
+        return 'but the covariances are too small.', False
+    if ratio is None or expected is None or expected[0] <= ratio <= expected[1]:
+        return 'and the covariances are right.', True
+    errors = f'the errors are {math.sqrt(ratio):.2f} times as large as they say.'
+    if ratio < expected[0]:
+        return f'and the covariances are cautious: {errors}', True
+    return f'but the covariances are too small: {errors}', False
 
 
 def error_map_figure(path: Path, truth: Trajectory, estimate: Trajectory) -> None:
@@ -346,8 +358,9 @@ def _weak_lines(truth: Trajectory, estimate: Trajectory) -> Iterator[str]:
         return
     worst = [k for k in worst_images(places, errors) if k.error_m > _WEAK * errors.mean()]
     for k in worst[:3]:
-        yield f'near x {k.x_m:.1f} m, y {k.y_m:.1f} m of the ground truth: {k.error_m:.2f} m'
+        yield f'near x {k.x_m:.1f} m, y {k.y_m:.1f} m: {k.error_m:.2f} m'
     if worst:
+        yield 'These coordinates are those of the ground truth.'
         yield 'Drive there in a further training drive, in two directions.'
     else:
         yield f'Nowhere is the error more than {_WEAK:g} times its mean.'

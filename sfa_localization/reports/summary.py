@@ -84,8 +84,15 @@ def judgment(trained: Trained) -> tuple[str, str]:
 
 
 def point_lines(quality: Mapping[str, Any]) -> list[str]:
-    """The error of the map at each measured point."""
-    return [
+    """The origin of satellite fixes, and the error of the map at each measured point."""
+    lines = []
+    if 'origin' in quality:
+        latitude, longitude = quality['origin']
+        lines = [
+            f'points: latitude {latitude:.7f}, longitude {longitude:.7f} is the origin; x east, '
+            'y north'
+        ]
+    return lines + [
         f'{point["name"]}: x {point["x_m"]:.2f} m, y {point["y_m"]:.2f} m: missed by '
         f'{point["miss_m"]:.3f} m' + ('' if point['used'] else ', left out')
         for point in quality.get('points', ())

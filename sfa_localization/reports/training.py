@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
-from sfa_localization.inspection import InspectionConfig, sparse_lanes
+from sfa_localization.inspection import InspectionConfig, covered_share, sparse_lanes
 from sfa_localization.metric.forecast import Forecast
 from sfa_localization.reports import figures, page
 from sfa_localization.reports.bag import motion_section
@@ -121,7 +121,8 @@ def advice(trained: Trained, places: Array) -> list[str]:
         f'Cross x {x:.1f} m, y {y:.1f} m, in two directions.' for x, y, *_ in weak_places(forecast)
     ]
     if not diagnostics.single_route:
-        lines += sparse_lanes(places, InspectionConfig().reach)
+        reach = InspectionConfig().reach
+        lines += sparse_lanes(covered_share(places, reach), reach)
     if diagnostics.directions < PARALLEL:
         lines.append('Drive in other directions: most of this drive was parallel.')
     if diagnostics.crossings < FEW_CROSSINGS:

@@ -2,14 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages through the Localizer, as they arrive."""
 
-from types import SimpleNamespace
-
 import numpy as np
 
 from robustness.judged import output
 from robustness.messages import Picture, Reading, Restart
 from robustness.recorded import model, to_truth
-from sfa_localization.camera.encodings import read_compressed
+from sfa_localization.camera.encodings import decode_compressed
 from sfa_localization.data.errors import CameraError, ModelError
 from sfa_localization.localizer import Localizer
 from sfa_localization.observer import Observation, Observer
@@ -42,7 +40,7 @@ class Robot:
         try:
             image = picture.image
             if picture.jpeg is not None:
-                image = read_compressed(SimpleNamespace(data=picture.jpeg, format='jpeg'))
+                image = decode_compressed(picture.jpeg)
             seen = self.localizer.observer.observe(message.stamp_ns, image)
         except (CameraError, ModelError):
             return

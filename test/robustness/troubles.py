@@ -6,23 +6,34 @@ or a driver would, and states the error and the sentence that are right.
 `PYTHONPATH=.:test python -m robustness --troubles` runs them all: train, then evaluate.
 """
 
+import itertools
 import json
+import math
 import re
 import subprocess
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 
+import cv2
 import numpy as np
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores
 
-from sfa_localization.bags.decoding import typestore
+from sfa_localization.bags.decoding import FIX, IMAGE, typestore
+from sfa_localization.bags.writer import blank
+from sfa_localization.camera.encodings import decode_compressed, encode_jpeg
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.messages import read_yaw
+from sfa_localization.data.sphere import rotation
 
 TRAINING, TEST = Path('bags/sample'), Path('bags/sample_test')
 IMAGES, ODOMETRY, IMU, TRUTH = '/panorama/compressed', '/odom', '/imu', '/ground_truth'
 SECOND_NS = 1_000_000_000
+STORE = typestore(Stores.ROS2_JAZZY)
 
 
 @dataclass(frozen=True)
@@ -41,6 +52,10 @@ class Trouble:
     """Whether the training drive has the trouble too."""
     options: tuple[str, ...] = ()
     """Of `train`."""
+    kinds: Mapping[str, str] = field(default_factory=dict)
+    """Types of topics that get others."""
+    camera: str = ''
+    """Parameters of omnicam_node, as YAML, for `train` and `evaluate`."""
 
 
 def stamp_of(message):
@@ -54,20 +69,21 @@ def restamp(message, stamp_ns):
     message.header.stamp = type(stamp)(*(int(part) for part in divmod(stamp_ns, SECOND_NS)))
 
 
-def alter(source, target, changes, seed=0):
+def alter(source, target, changes, seed=0, kinds=types.MappingProxyType({})):
     """Write a bag with some of its messages changed; the order and times of reception stay."""
-    types, rng = typestore(Stores.ROS2_JAZZY), np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     with Reader(source) as bag, Writer(target, version=9, storage_plugin=StoragePlugin.MCAP) as out:
         topics = {
-            c.topic: out.add_connection(c.topic, c.msgtype, typestore=types)
+            c.topic: out.add_connection(c.topic, kinds.get(c.topic, c.msgtype), typestore=STORE)
             for c in bag.connections
         }
         for connection, received_ns, data in bag.messages():
             name, kind = connection.topic, connection.msgtype
-            message = types.deserialize_cdr(data, kind)
+            message = STORE.deserialize_cdr(data, kind)
             taken = changes[name](message, rng) if name in changes else None
             for part in [message] if taken is None else taken:
-                out.write(topics[name], received_ns, bytes(types.serialize_cdr(part, kind)))
+                part = STORE.serialize_cdr(part, topics[name].msgtype)
+                out.write(topics[name], received_ns, bytes(part))
 
 
 def run(*command):
@@ -83,18 +99,24 @@ def tried(name, folder, model):
     """What train and evaluate say of a trouble, and the errors of one image and of the filter, m;
     None after a refusal. `model` is that of the untouched drive.
     """
-    trouble, text = TROUBLES[name], ''
+    trouble, text, parameters = TROUBLES[name], '', []
+    if trouble.camera:
+        parameters = ['--config', folder / 'parameters.yaml']
+        parameters[1].write_text(
+            f'/**/omnicam_node: {{ros__parameters: {{{trouble.camera}}}}}', encoding='utf-8'
+        )
     for source in (TRAINING, TEST) if trouble.trains else (TEST,):
-        alter(source, folder / source.name, trouble.changes())
+        alter(source, folder / source.name, trouble.changes(), kinds=trouble.kinds)
     training = folder / TRAINING.name if trouble.trains else TRAINING
     if trouble.trains:
         model = folder / 'model.npz'
-        code, text = run('train', training, '--output', model, *trouble.options)
+        code, text = run('train', training, '--output', model, *trouble.options, *parameters)
         if code:
             return text, None
     results = folder / 'results.json'
     test = folder / TEST.name
-    code, said = run('evaluate', model, test, '--align', training, '--json', results)
+    options = '--ground-truth-topic', TRUTH, '--align', training, '--json', results
+    code, said = run('evaluate', model, test, *options, *parameters)
     if code:
         return text + said, None
     errors = json.loads(results.read_text())
@@ -119,6 +141,201 @@ def lost(m, rng, share=0.05):
         m.pose.orientation = type(m.pose.orientation)(0.0, 0.0, 0.0, 1.0)
 
 
+def wrong_rate(share, value):
+    """A gyroscope of which a share of the messages reports another rate, rad/s."""
+
+    def change(m, rng):
+        if rng.random() < share:
+            m.angular_velocity.z = value * rng.choice([-1.0, 1.0])
+
+    return change
+
+
+def held_rate(period_s=4.0, share=0.25):
+    """A gyroscope that repeats a rate for a share of each period."""
+    last = [0.0]
+
+    def change(m, _):
+        if stamp_of(m) * 1e-9 % period_s < share * period_s:
+            m.angular_velocity.z = last[0]
+        last[0] = m.angular_velocity.z
+
+    return change
+
+
+def second_publisher():
+    """Every second message comes from another publisher, whose origin is elsewhere."""
+    count = itertools.count()
+
+    def change(m, _):
+        if next(count) % 2:
+            place, q = m.pose.pose.position, m.pose.pose.orientation
+            place.x, place.y = 2.0 - place.y, 1.0 + place.x  # turned by 90 degrees
+            q.z, q.w = (q.z + q.w) / math.sqrt(2.0), (q.w - q.z) / math.sqrt(2.0)
+
+    return change
+
+
+def fill(m, x, quaternion, twist=True):
+    """Fill the pose of a message with this x and quaternion, and perhaps its twist with zeros."""
+    m.pose.pose.position.x, m.pose.pose.position.y = x, 0.0
+    m.pose.pose.orientation = type(m.pose.pose.orientation)(*quaternion)
+    if not twist:
+        m.twist.twist.linear.x = m.twist.twist.angular.z = 0.0
+
+
+def zeros_at_times(m, rng):
+    """A driver that sends a message of zeros now and then."""
+    if rng.random() < 0.02:
+        fill(m, 0.0, (0, 0, 0, 1), twist=False)
+
+
+def ahead(topic, seconds):
+    """Changes that stamp a topic so many s ahead."""
+    return {topic: lambda m, _: restamp(m, stamp_of(m) + round(seconds * SECOND_NS))}
+
+
+def fast(topic, rate):
+    """Changes by a clock that gains `rate` s in each second since the first message."""
+    first = []
+
+    def change(m, _):
+        first.append(stamp_of(m))
+        restamp(m, first[0] + round((first[-1] - first[0]) * (1 + rate)))
+
+    return {topic: change}
+
+
+def following(lag_s):
+    """Changes by a camera that turns its images after the robot, with a lag."""
+    state = {}
+
+    def turned(m, _):
+        q, now = m.pose.pose.orientation, stamp_of(m)
+        yaw = 2 * np.arctan2(q.z, q.w)
+        before, shown = state.get('yaw', (now, yaw))
+        behind = (yaw - shown + np.pi) % (2 * np.pi) - np.pi
+        shown += behind * -np.expm1((before - now) / (lag_s * SECOND_NS))
+        state.update(yaw=(now, shown), behind=yaw - shown)
+
+    def roll(m, _):
+        image = cv2.imdecode(np.asarray(m.data), cv2.IMREAD_COLOR)
+        columns = round(-state.get('behind', 0.0) * image.shape[1] / (2 * np.pi))
+        m.data = cv2.imencode('.jpg', np.roll(image, columns, 1))[1].ravel()
+
+    return {ODOMETRY: turned, IMAGES: roll}
+
+
+def fixed(m, rng):
+    """A receiver of satellites, 50 degrees north, with corrections of a base station."""
+    east, north = np.array([m.pose.position.x, m.pose.position.y]) + rng.normal(0, 0.02, 2)
+    answer = blank(STORE, FIX)
+    answer.header, answer.position_covariance_type = m.header, 2
+    answer.position_covariance[[0, 4]] = 0.02**2
+    answer.latitude, answer.longitude = 50 + north / 111_229.0, 8 + east / 71_695.8
+    return [answer]
+
+
+def unpacked(m, _):
+    """A driver that leaves out the step of raw images."""
+    image = decode_compressed(m.data)
+    answer = blank(STORE, IMAGE)
+    answer.header, answer.encoding, answer.data = m.header, 'bgr8', image.ravel()
+    answer.height, answer.width = image.shape[:2]
+    return [answer]
+
+
+def paused(begin_s=55, end_s=80):
+    """A recording that paused while the robot drove on, and odometry that started anew."""
+    times, starts = [], []
+
+    def seconds(m):
+        times.append(stamp_of(m))
+        return (times[-1] - times[0]) / SECOND_NS
+
+    def kept(m, _):
+        return [] if begin_s < seconds(m) < end_s else [m]
+
+    def started_anew(m, _):
+        pose, driven_s = m.pose.pose, seconds(m)
+        if driven_s < end_s:
+            return [m] if driven_s <= begin_s else []
+        yaw, place = read_yaw(pose.orientation), pose.position.x + 1j * pose.position.y
+        starts.append((yaw, place))
+        yaw, place = yaw - starts[0][0], (place - starts[0][1]) * np.exp(-1j * starts[0][0])
+        pose.position.x, pose.position.y = place.real, place.imag
+        pose.orientation.z, pose.orientation.w = np.sin(yaw / 2), np.cos(yaw / 2)
+        return [m]
+
+    return dict.fromkeys((IMAGES, IMU, TRUTH), kept) | {ODOMETRY: started_anew}
+
+
+def cut_off(m, rng, share=0.125):
+    """A camera that loses bytes in the middle of some JPEGs."""
+    if rng.random() < share:
+        first = int(len(m.data) * rng.uniform(0.25, 0.6))
+        m.data = np.delete(m.data, slice(first, first + len(m.data) // 4))
+
+
+def as_video(key_every=30):
+    """A driver that publishes H.264, with a key frame every few images."""
+    import av
+
+    encoder = av.CodecContext.create('libx264', 'w')
+    encoder.options = {'tune': 'zerolatency', 'crf': '18', 'g': str(key_every)}
+    encoder.pix_fmt, encoder.time_base = 'yuv420p', Fraction(1, 10)
+    encoder.width, encoder.height = 600, 60
+
+    def encode(m, _):
+        frame = av.VideoFrame.from_ndarray(decode_compressed(m.data), format='bgr24')
+        packets = encoder.encode(frame.reformat(format='yuv420p'))
+        m.format, m.data = 'h264', np.frombuffer(b''.join(map(bytes, packets)), np.uint8)
+
+    return encode
+
+
+def seen(change):
+    """A change of panoramas (H, W, 3)."""
+
+    def changed(m, rng):
+        image = change(decode_compressed(m.data.tobytes()), rng)
+        m.data = np.frombuffer(encode_jpeg(image, 90), np.uint8)
+
+    return {IMAGES: changed}
+
+
+def body(share, top=0.0, plain=False):
+    """The robot itself, textured or plain gray, behind: on a share of the columns, and from a share
+    of the height downward.
+    """
+    colors = np.random.default_rng(7).integers(0, 255, (6, 15, 3), np.uint8)
+
+    def change(image, rng):
+        height, width = image.shape[:2]
+        size = round(share * width), height - round(top * height)
+        part = cv2.resize(colors, size, interpolation=cv2.INTER_NEAREST)
+        part = np.full_like(part, 90) if plain else part
+        image = np.roll(image, size[0] // 2, axis=1)
+        image[-size[1] :, : size[0]] = part
+        return np.roll(image, -(size[0] // 2), axis=1)
+
+    return seen(change)
+
+
+def mounted(roll, pitch, yaw):
+    """A camera that sits on the robot at these angles, degrees."""
+    turn = rotation(*np.radians([roll, pitch, yaw]))
+
+    def change(image, rng):
+        sphere, size = PanoramaConfig().sphere, image.shape[:2]
+        pixels = sphere.pixels(sphere.rays(*size) @ turn.T, *size).astype(np.float32)
+        around = np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
+        maps = pixels[..., 0] + 1, pixels[..., 1]
+        return cv2.remap(around, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    return seen(change)
+
+
 RIGHT_M = 0.055, 0.055
 """One image and filter of the untouched drive err by 0.042 m: a trouble that is mended adds a
 little."""
@@ -129,6 +346,78 @@ TROUBLES = {
     'truth: 0.3 s late': Trouble(
         lambda: {TRUTH: lambda m, _: restamp(m, stamp_of(m) + 300_000_000)},
         RIGHT_M, 'ground truth.* 0.30 s late', trains=False,
+    ),
+    'gyroscope: 20 % zeros': Trouble(
+        lambda: {IMU: wrong_rate(0.2, 0.0)}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
+    ),
+    'gyroscope: 1 % spikes': Trouble(
+        lambda: {IMU: wrong_rate(0.01, 30.0)}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
+    ),
+    'gyroscope: held': Trouble(
+        lambda: {IMU: held_rate()}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
+    ),
+    'gyroscope: half of it zeros': Trouble(
+        lambda: {IMU: wrong_rate(0.5, 0.0)}, RIGHT_M, 'gyroscope: left out: the wheels agree better'
+    ),
+    'odometry: two publishers': Trouble(
+        lambda: {ODOMETRY: second_publisher()}, None, 'two publishers on /odom: .*; stop one'
+    ),
+    'odometry: single zeros': Trouble(
+        lambda: {ODOMETRY: zeros_at_times},
+        RIGHT_M, 'messages left out: pose beside the path',
+    ),
+    'odometry: quaternion of zeros': Trouble(
+        lambda: {ODOMETRY: lambda m, _: fill(m, 0.0, (0, 0, 0, 0))},
+        RIGHT_M, 'have no pose .*; the twist is integrated',
+    ),
+    'odometry: NaN poses': Trouble(
+        lambda: {ODOMETRY: lambda m, _: fill(m, math.nan, (0, 0, 0, 1))},
+        RIGHT_M, 'have no pose .*; the twist is integrated',
+    ),
+    'images: TAI': Trouble(
+        lambda: ahead(IMAGES, 37), RIGHT_M, r'images: stamped 37\.0 s ahead .* in TAI'
+    ),
+    'odometry: GPS time': Trouble(
+        lambda: ahead(ODOMETRY, 18), RIGHT_M, r'images: stamped 18\.0 s behind .*/odom in GPS time'
+    ),
+    'images: an hour behind': Trouble(
+        lambda: ahead(IMAGES, -3600.4), RIGHT_M, r'images: stamped 3600\.4 s behind'
+    ),
+    'images: 0.3 % fast': Trouble(
+        lambda: fast(IMAGES, 0.003), RIGHT_M, r'images: their clock runs 0\.30 % fast'
+    ),
+    'odometry: 0.5 % slow': Trouble(
+        lambda: fast(ODOMETRY, -0.005), (0.1, 0.1), r'odometry: its clock runs 0\.50 % slow'
+    ),
+    'images follow the turns': Trouble(
+        lambda: following(0.5), None, "images follow the robot's turns with a lag of 0.5 s"
+    ),
+    'points: fixes of a receiver': Trouble(
+        lambda: {TRUTH: fixed}, (0.06, 0.07), 'latitude .*, longitude .* is the origin',
+        options=('--points-topic', TRUTH), kinds={TRUTH: FIX},
+    ),
+    'images: step left out': Trouble(
+        lambda: {IMAGES: unpacked}, RIGHT_M, 'images: 140 used', kinds={IMAGES: IMAGE},
+    ),
+    'odometry: starts anew after a pause': Trouble(
+        paused, (0.1, 0.1), 'odometry pauses once, first after 55.0 s',
+    ),
+    'images: JPEGs cut off': Trouble(
+        lambda: {IMAGES: cut_off}, RIGHT_M, 'images: .* cut-off JPEG'
+    ),
+    'images: H.264': Trouble(lambda: {IMAGES: as_video()}, RIGHT_M, 'images: 140 used'),
+    'body behind, a quarter': Trouble(
+        lambda: body(0.25), (1.0, 1.0), r'shows the robot: set blind_sectors: \[1[23].*, 2[34]'
+    ),
+    'body behind, the lower half': Trouble(
+        lambda: body(0.2, top=0.5, plain=True), (1.0, 1.0), 'the lower [45].% of the view from 1'
+    ),
+    'mast behind, hidden': Trouble(
+        lambda: body(0.06), (0.08, 0.065), 'SFA, one', camera='blind_sectors: [165.0, 195.0]'
+    ),
+    'camera askew, mount_rpy set': Trouble(
+        lambda: mounted(5.0, 0.0, 30.0), (0.07, 0.055), 'SFA, one',
+        camera='mount_rpy: [5.0, 0.0, 30.0]',
     ),
 }  # fmt: skip
 

@@ -1,0 +1,78 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The ground on which a robot drove in training, and the error to expect there: a map to look at,
+and to plan on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from sfa_localization.data.geometry import Array, Indices, Mask
+from sfa_localization.metric.settings import GroundConfig
+
+# Images farther from the one before are drawn apart: the drive between them is not in the map.
+_JOINED_M = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Cells:
+    """Which square cells (H, W), row 0 at the lowest y, the robot drove on; `corner` (2,) m is the
+    lower left corner of the first cell in the map.
+    """
+
+    driven: Mask
+    corner: Array
+    size_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class DrivenGround:
+    """Places (P, 2) m of base_link in the map, in the order of driving. `joined` (P,) tells whether
+    the robot drove there from the place before; `expected_m` (P,) is the error of one image.
+    """
+
+    places: Array
+    joined: Mask
+    expected_m: Array
+
+    @classmethod
+    def of(cls, places: Array, drive: Indices, expected_m: Array) -> DrivenGround:
+        """Of images at places (P, 2), each of a drive (P,)."""
+        near = np.hypot(*np.diff(places, axis=0).T) <= _JOINED_M
+        return cls(places, np.append(False, near & (np.diff(drive) == 0)), expected_m)
+
+    @property
+    def lines(self) -> Indices:
+        """Rows (L, 2) of the places at the ends of each stretch that was driven."""
+        ends = np.flatnonzero(self.joined)
+        return np.column_stack([ends - 1, ends])
+
+    def cells(self, config: GroundConfig) -> Cells:
+        """The cells that a robot of some width covered."""
+        size_m, reach_m, ends = config.cell, config.width / 2, self.places[self.lines]
+        part = np.linspace(0.0, 1.0, int(np.ceil(_JOINED_M / size_m)) + 1)[:, None]
+        between = ends[:, :1] + part * (ends[:, 1:] - ends[:, :1])
+        points = np.concatenate([self.places, between.reshape(-1, 2)])
+        margin = int(np.ceil(reach_m / size_m)) + 1
+        corner = (np.floor(points.min(0) / size_m) - margin) * size_m
+        column, row = np.floor((points - corner) / size_m).astype(int).T
+        away = np.ones((row.max() + margin + 1, column.max() + margin + 1), bool)
+        away[row, column] = False
+        return Cells(ndimage.distance_transform_edt(away) * size_m <= reach_m, corner, size_m)
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays to save."""
+        return {'places': self.places, 'joined': self.joined, 'expected_m': self.expected_m}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> DrivenGround:
+        """Read the arrays of `to_arrays`."""
+        return cls(arrays['places'].astype(float), arrays['joined'].astype(bool),
+                   arrays['expected_m'].astype(float))  # fmt: skip

@@ -1,0 +1,91 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""An input of images: each alone in its message, or packets of a video."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+from sfa_localization.camera.video import ImageReader
+from sfa_localization.data.errors import CameraError, ConfigError, LocalizationError
+from sfa_localization.data.messages import read_stamp
+from sfa_localization.data.run import Image
+from sfa_localization.nodes.lifecycle import LocalizationNode, sensor_qos
+
+TYPES = {
+    'raw': 'sensor_msgs/msg/Image',
+    'compressed': 'sensor_msgs/msg/CompressedImage',
+    'ffmpeg': 'ffmpeg_image_transport_msgs/msg/FFMPEGPacket',
+    'foxglove': 'foxglove_msgs/msg/CompressedVideo',
+}
+"""Types of messages by the names that image_transport gives to them."""
+_PACKETS = 30
+"""Packets of a video that wait, a second of most: a lost one costs all images until a key frame. Of
+other images only the newest waits, as they may come faster than they are used."""
+
+
+class ImageInput:
+    """Calls `use` with stamp, ns, image (H, W, 3) uint8 BGR and frame of each image on `topic`.
+
+    Raises ConfigError where the messages of the transport are not installed.
+    """
+
+    def __init__(
+        self,
+        node: LocalizationNode,
+        transport: str,
+        topic: str,
+        use: Callable[[int, Image, str], None],
+    ) -> None:
+        self._node, self._topic, self._use = node, topic, use
+        self._kind = _message_class(transport)
+        self.types = sorted(TYPES.values(), key=lambda kind: kind != TYPES[transport])
+        """Types of image messages, this input's first."""
+        self._holds_video = transport in ('ffmpeg', 'foxglove')
+        self._subscription: Any = None
+        self._substitute = ''
+
+    def start(self, substitute: str = '') -> None:
+        """Subscribe to the topic, or to a substitute for it."""
+        self._reader, self._substitute = ImageReader(self._kind.__name__), substitute
+        depth, entity = (_PACKETS, 'video') if self._holds_video else (1, None)
+        self._subscription = self._node.subscribe(
+            self._kind, self._topic, self._receive, sensor_qos(depth), substitute, entity
+        )
+
+    def stop(self) -> None:
+        """End the subscription, if any."""
+        self._node.unsubscribe(self._subscription)
+        self._subscription = None
+
+    def _receive(self, message: Any) -> None:
+        has_header = self._kind.__name__ != 'CompressedVideo'
+        source = message.header if has_header else message
+        stamp_ns = read_stamp(source.stamp if has_header else message.timestamp)
+        problem: LocalizationError | None = None
+        for image_ns, image in self._reader.add(stamp_ns, message):
+            try:
+                if isinstance(image, CameraError):
+                    raise image
+                self._use(image_ns, image, source.frame_id)
+            except LocalizationError as error:
+                problem = error
+        if self._reader.is_video and not self._holds_video:
+            self._holds_video = True
+            self.stop()
+            self.start(self._substitute)
+        if problem is not None:
+            raise problem
+
+
+def _message_class(transport: str) -> Any:
+    package, _, name = TYPES[transport].split('/')
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), name)
+    except ImportError:
+        apt = f'ros-$ROS_DISTRO-{package.replace("_", "-")}'
+        raise ConfigError(
+            f'image_transport {transport} needs {package}: sudo apt install {apt}'
+        ) from None
