@@ -1,16 +1,24 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The three nodes: started in any order, played at any pace, fed faster than they compute."""
+"""The three nodes: started in any order, played at any pace, fed faster than they compute; and what
+judges the troubles of recorded drives.
+"""
 
 import itertools
+import json
 import math
+import re
 import threading
 import time
 
+import numpy as np
 import pytest
 from filter_drives import NOISY, START_NS, FilterDrive
 from picture_readers import SIZE, PictureReader, panorama
+from robustness import troubles
+from robustness.__main__ import tell_troubles
 
+from sfa_localization.bags.drives import read_drive
 from sfa_localization.place_model import PlaceModel
 
 pytest.importorskip('rclpy')
@@ -172,3 +180,89 @@ def test_of_odometry_that_comes_too_fast_the_newest_is_used_and_said_to_be_behin
     assert len(seen) < 10 and math.isfinite(node.filter.state.position_std)
     bench.publish('odom', standing(last + 20_000_000))
     assert until(lambda: 'behind' not in states[-1].data)
+
+
+NAMED = 'warning: truth: 3 of 40 poses are zero: left out'
+RIGHT_M = 0.055, 0.055
+
+
+def answer(monkeypatch, means_m, said, code=0, **stated):
+    """Commands answer so of a trouble of the truth; a list that grows by each that is run."""
+    commands = []
+
+    def run(*command):
+        commands.append(command)
+        if command[0] == 'evaluate' and not code:
+            errors = {key: {'mean': e} for key, e in zip(('sfa', 'ekf'), means_m, strict=True)}
+            command[-1].write_text(json.dumps(errors))
+        return code, said
+
+    stated = {'errors_m': RIGHT_M, 'says': 'truth: .* zero', 'trains': False} | stated
+    monkeypatch.setattr(troubles, 'TROUBLES', {'zeros': troubles.Trouble(dict, **stated)})
+    monkeypatch.setattr(troubles, 'alter', lambda source, target, *_, **__: target.mkdir())
+    monkeypatch.setattr(troubles, 'run', run)
+    return commands
+
+
+@pytest.mark.parametrize(
+    ('wanted_m', 'errors_m', 'said', 'right'),
+    [
+        (RIGHT_M, (0.05, 0.05), NAMED, True),
+        (RIGHT_M, (0.05, 0.06), NAMED, False),
+        (RIGHT_M, (0.06, 0.05), NAMED, False),
+        (RIGHT_M, (0.05, math.nan), NAMED, False),
+        (RIGHT_M, (0.05, 0.05), 'warning: truth', False),
+        (RIGHT_M, (0.05, 0.05), '', False),
+        (RIGHT_M, None, NAMED, False),
+        (None, None, NAMED, True),
+        (None, None, 'error: of another reason', False),
+        (None, (0.01, 0.01), NAMED, False),
+    ],
+)
+def test_a_trouble_that_is_not_named_or_errs_too_much_is_told_as_wrong(
+    monkeypatch, capsys, wanted_m, errors_m, said, right
+):
+    """Where a refusal is right, an estimate is wrong, however good."""
+    answer(monkeypatch, errors_m, f'  {said}\n', code=errors_m is None, errors_m=wanted_m)
+    assert tell_troubles(['zeros']) is not right
+    (line,) = capsys.readouterr().out.splitlines()
+    assert ('<- WRONG' in line) is not right and ('refused' in line) == (errors_m is None)
+    assert said in line
+
+
+def test_the_model_of_the_untouched_drive_judges_troubles_of_the_truth_alone(monkeypatch, tmp_path):
+    commands = answer(monkeypatch, (0.04, 0.05), NAMED)
+    assert [*troubles.table(tmp_path)] == [('zeros', '0.040 / 0.050', NAMED, True)]
+    (train, source, *_, model), (evaluate, used, test, *options) = commands
+    assert (train, evaluate, used) == ('train', 'evaluate', model)
+    assert source == troubles.TRAINING == options[options.index('--align') + 1]
+    assert test.parent.parent == tmp_path
+    # A sensor's trouble is in the training too; a refusal ends it.
+    commands = answer(monkeypatch, None, NAMED, code=1, trains=True, options=('--every', '2'))
+    (tmp_path / 'sensor').mkdir()
+    ((*_, right),) = troubles.table(tmp_path / 'sensor')
+    ((train, training, *options),) = commands
+    assert not right and training.is_dir() and options[-2:] == ['--every', '2']
+
+
+def test_a_bag_with_a_trouble_differs_in_nothing_else(tmp_path):
+    def later(message, _):
+        troubles.restamp(message, troubles.stamp_of(message) + 10**9 + 1)
+
+    changes = {troubles.TRUTH: later, troubles.IMU: lambda m, _: []}
+    troubles.alter(troubles.TEST, tmp_path / 'bag', changes)
+    before, after = (
+        read_drive(bag, tmp_path / name, want_truth=True)
+        for name, bag in (('before', troubles.TEST), ('after', tmp_path / 'bag'))
+    )
+    assert np.array_equal(after.odometry.poses, before.odometry.poses)
+    assert np.array_equal(after.panoramas.stamps_ns, before.panoramas.stamps_ns)
+    assert after.yaw_rate is None
+    late_ns = after.ground_truth.stamps_ns - before.ground_truth.stamps_ns
+    assert np.all(late_ns == 10**9 + 1)
+
+
+def test_every_trouble_states_what_is_right():
+    for stated in troubles.TROUBLES.values():
+        assert re.compile(stated.says).pattern
+        assert stated.errors_m is None or min(stated.errors_m) > 0.042

@@ -434,4 +434,5 @@ def table(folder, names=()):
         text, errors_m = tried(name, part, model)
         right, said = verdict(name, text, errors_m)
         errors = ' / '.join(f'{e:.3f}' for e in errors_m) if errors_m else 'refused'
-        yield name, errors, said or text.strip().splitlines()[-1], right
+        last = text.strip().splitlines()[-1:]
+        yield name, errors, said or ''.join(last), right
