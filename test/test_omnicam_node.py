@@ -256,6 +256,18 @@ def test_masks_elevation_and_mount_change_while_running_and_are_declared(bench):
     assert until(lambda: np.array_equal(pixels(answer(bench, heard, message())), expected))
 
 
+def test_panoramas_of_the_camera_are_mounted_and_masked(bench):
+    """Also those that need no description."""
+    given = {'camera_model': '', 'blind_sectors': [100.0, 140.0], 'mount_rpy': [5.0, 0.0, 30.0]}
+    _, heard = start(bench, **given)
+    camera = CameraConfig(**{k: tuple(v) if k != 'camera_model' else v for k, v in given.items()})
+    strip = raw_picture()[:120]
+    panorama = answer(bench, heard, to_image(strip, STAMP_NS, 'camera'))
+    expected = Unwrapper(camera, PANORAMA)(strip)
+    np.testing.assert_array_equal(pixels(panorama), expected)
+    assert not np.array_equal(expected, Unwrapper(CameraConfig(), PANORAMA)(strip))
+
+
 def with_rules(*rules):
     return {'cli_args': ['--ros-args', *(word for rule in rules for word in ('-r', rule))]}
 
@@ -267,6 +279,8 @@ def test_impossible_cameras_do_not_start_and_impossible_changes_are_rejected(ben
     for parameters, words in (
         ({'calibration_file': 'nowhere.yaml'}, 'nowhere.yaml'),
         ({'elevation_min': 60.0, 'elevation_max': 80.0}, 'sees no part'),
+        ({'camera_model': '', 'mask_file': 'nowhere.png'}, 'mask_file is missing'),
+        ({'camera_model': '', 'blind_sectors': [-180.0, 180.0]}, 'sees no part'),
         (loop, 'which this node itself publishes: remap'),
         ({'image_transport': 'ffmpeg'}, 'apt install ros-$ROS_DISTRO-ffmpeg-image-transport-msgs'),
     ):

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from sfa_localization.data.errors import DataError
+from sfa_localization.data.events import CLOCK_RANGE_S
 from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_angle
 from sfa_localization.data.run import Trajectory
 from sfa_localization.data.statistics import LENGTH_TO_STD, evenly, outlier_factor, surprise
@@ -36,8 +37,9 @@ WINDOW_M, WINDOWS_MIN, NOISE_M = 3.0, 4, 0.01
 UNSTEADY = 0.15
 """Mean of 1 - cos of the rotations from window to window: at most 0.09 for real robots with their
 own truth, 0.2 and more with that of another drive or with mirrored axes."""
-CERTAIN = 4.0
-"""Standard deviations from 0 of a lever arm or a delay; those of right truths were below 2.5."""
+CERTAIN = 9.0
+"""Twice the least gain of log-likelihood by a lever arm or a delay: chance reaches it in 3 of 1,000
+drives; 6 was the most of drives of real robots, 12 for a truth 0.1 s late over 28 m."""
 LEVER_MIN_M, WAY_MIN_M = 1.6 * TURN_SLIDE, 0.04
 """Smaller lever arms, and ways during a delay, stay: wheels that slide in turns look like a lever
 arm of TURN_SLIDE."""
@@ -47,8 +49,7 @@ ASIDE = np.deg2rad(10.0)
 """A smaller offset of the headings may be that of either source."""
 WHEELS_STD = 0.05
 """Of the scale of a window, by the drives of the simulator."""
-_PRIOR = np.array([1.0, 1.0, 1.0, 0.5, TURN_SLIDE])
-_PULLED = np.array([1.0, 1.0, 0.0, 0.0, 1.0])  # to 0
+_PRIOR = np.array([1.0, 1.0, 1.0, 0.1, TURN_SLIDE])
 _SHIFTS_S, _ROUNDS, _SAMPLES, _STEP_S = (0.0, -1.0, 1.0, -2.0, 2.0), 12, 4000, 0.05
 _LEVER, _DELAY = [0, 1], [2]  # of theta
 _CLOSE = 1e-4  # m and s
@@ -71,14 +72,15 @@ class TruePoses:
 @dataclass(frozen=True, slots=True)
 class _Fit:
     """Values of `theta` (5,): lever arm ahead and to the left, m, delay, s, logarithm of the scale,
-    loss, m per rad; with their `covariance`. `residual` (M,) m, and heading `yaw` (M,) rad of
-    base_link in the frame of the truth, of the samples `rows` (M,) that the odometry covers.
+    loss, m per rad, of which `free` ones were fitted. Of the samples `rows` (M,) that the odometry
+    covers: `residual` (M,) m with its robust `std`, and heading `yaw` (M,) rad of base_link in the
+    frame of the truth by the odometry.
     """
 
     mirrored: bool
     free: Mask
     theta: Array
-    covariance: Array
+    std: float
     rows: Indices
     residual: Complex
     yaw: Array
@@ -93,20 +95,13 @@ class _Fit:
     def delay_s(self) -> float:
         return float(self.theta[2])
 
-    @property
-    def cost(self) -> float:
-        """Negative log-likelihood of a sample."""
-        return float(surprise(np.abs(self.residual / FAULT_M) ** 2, 2).mean())
+    def cost(self, std: float) -> float:
+        """Negative log-likelihood of a place, for residuals of a standard deviation in m."""
+        return float(surprise(np.abs(self.residual / std) ** 2, 2).mean())
 
     @property
     def unsteady(self) -> float:
         return 1.0 - float((self.turns[1:] * self.turns[:-1].conj()).real.mean())
-
-    def needs(self, chosen: list[int], least: float) -> bool:
-        """Whether values are certainly not 0, and larger than the `least` that matters."""
-        value, spread = self.theta[chosen], self.covariance[np.ix_(chosen, chosen)]
-        squares = float(value @ np.linalg.solve(spread, value))
-        return squares > CERTAIN**2 and float(np.linalg.norm(value)) > least
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,16 +147,20 @@ class _Linear:
     drove: Mask
 
     def step(
-        self, theta: Array, free: Mask, windows: _Windows, weight: Array, variance: float
-    ) -> tuple[Array, Array]:
-        """The step (5,) of Gauss and Newton, and the covariance (5, 5) of theta."""
-        score = windows.sums(weight[:, None] * (self.residual[:, None] * self.slopes.conj()).real)
+        self,
+        theta: Array,
+        expected: Array,
+        free: Mask,
+        weight: Array,
+        variance: float,
+    ) -> Array:
+        """The step (5,) of Gauss and Newton; windows of weight 1 have the `variance`, m^2."""
+        score = (weight[:, None] * (self.residual[:, None] * self.slopes.conj()).real).sum(0)
         normal = ((weight[:, None] * self.slopes).conj().T @ self.slopes).real
-        prior, inverse, both = variance / _PRIOR**2, np.zeros((5, 5)), np.ix_(free, free)
-        inverse[both] = np.linalg.inv((normal + np.diag(prior))[both])
-        step = inverse @ (score.sum(0) - prior * theta * _PULLED)
-        covariance = inverse @ (score.T @ score + variance * normal) @ inverse
-        return np.clip(step, -0.5, 0.5), covariance
+        prior, both, step = variance / _PRIOR**2, np.ix_(free, free), np.zeros(5)
+        score -= prior * (theta - expected)
+        step[free] = np.linalg.solve((normal + np.diag(prior))[both], score[free])
+        return np.clip(step, -0.5, 0.5)
 
 
 class _Comparison:
@@ -198,26 +197,29 @@ class _Comparison:
         behind = int(np.argmax(product)) - len(by_wheels) + 1
         return float(self.seconds[0] - self.track_s[0]) + 4 * _STEP_S * behind
 
-    def fitted(self, mirrored: bool, theta: Array, free: Mask, rows: Indices) -> _Fit | None:
-        """Start at theta (5,), and change its `free` values; None without enough motion."""
-        at = self.seconds[rows] - theta[2]
-        rows = rows[(at >= self.track_s[0]) & (at <= self.track_s[-1])]
+    def fitted(
+        self, mirrored: bool, theta: Array, free: Mask, rows: Indices, about_s: float
+    ) -> _Fit | None:
+        """Start at theta (5,), and change its `free` values, in windows for a delay of about so
+        much; None without enough motion.
+        """
+        at = self.seconds[rows] - about_s
+        inside = (at >= self.track_s[0]) & (at <= self.track_s[-1])
+        rows, at = rows[inside], at[inside]
         if self.used[rows].sum() < 3 * WINDOWS_MIN:
             return None
-        at = self.seconds[rows] - theta[2]
-        way, after = (
-            np.interp(at, self.track_s, self.way),
-            np.searchsorted(self.track_s, at, 'right'),
-        )
+        way = np.interp(at, self.track_s, self.way)
+        after = np.searchsorted(self.track_s, at, 'right')
         windows = _Windows.of(np.column_stack([way // self.window_m, self.track.part[after - 1]]))
         used, each = self.used[rows], len(rows) / len(windows.first)
         weight, std = used + 1e-6, NOISE_M
+        expected = np.where(np.abs(theta) > CLOCK_RANGE_S, theta, 0.0)  # a clock of its own
         for _ in range(_ROUNDS):
             linear = self._linear(mirrored, theta, rows, windows, weight, each * std**2)
             size = np.abs(linear.residual)
             std = max(LENGTH_TO_STD * float(np.median(size[used])), NOISE_M)
             weight = (used + 1e-6) / outlier_factor((size / std) ** 2, 2)
-            step, covariance = linear.step(theta, free, windows, weight, each * std**2)
+            step = linear.step(theta, expected, free, weight, each * std**2)
             theta = theta + step
             if np.abs(step).max() < _CLOSE:
                 break
@@ -227,7 +229,7 @@ class _Comparison:
         turns = linear.turns[linear.drove]
         turned = np.interp(way, middle[linear.drove], np.unwrap(np.angle(turns)))
         yaw = np.interp(self.seconds[rows] - theta[2], self.track_s, self.track.yaw) + turned
-        return _Fit(mirrored, free, theta, covariance, rows, linear.residual, yaw, turns)
+        return _Fit(mirrored, free, theta, std, rows, linear.residual, yaw, turns)
 
     def _linear(
         self,
@@ -270,8 +272,10 @@ class _Comparison:
         rows, chosen = evenly(len(self.seconds), _SAMPLES), []
         for mirrored in (False, True):
             starts = [np.array([0.0, 0.0, s, 0.0, 0.0]) for s in shifts_s]
-            fits = [self.fitted(mirrored, start, free, rows) for start in starts]
-            chosen.append(min((fit for fit in fits if fit), key=lambda fit: fit.cost, default=None))
+            fits = [self.fitted(mirrored, start, free, rows, start[2]) for start in starts]
+            chosen.append(
+                min((fit for fit in fits if fit), key=lambda fit: fit.cost(FAULT_M), default=None)
+            )
         plain, mirror = chosen
         if plain is None or mirror is None:
             return plain
@@ -282,23 +286,25 @@ class _Comparison:
         steps = np.diff(self.way)
         speed = float((steps**2 / np.diff(self.track_s)).sum() / max(steps.sum(), 1e-9))
         least_s = max(LATE_S, WAY_MIN_M / speed)
-        rows = np.arange(len(self.seconds))
+        rows, about_s = np.arange(len(self.seconds)), float(fit.theta[2])
 
         def refitted(free: Mask) -> _Fit:
             theta = np.where(free, fit.theta, 0.0)
-            return self.fitted(fit.mirrored, theta, free, rows) or fit
+            return self.fitted(fit.mirrored, theta, free, rows, about_s) or fit
 
         fit = refitted(free)
         for _ in range(2):
-            fewer = [
-                refitted(np.where(np.isin(np.arange(5), chosen), False, free))
-                for chosen, least in ((_LEVER, LEVER_MIN_M), (_DELAY, least_s))
-                if free[chosen].all() and not fit.needs(chosen, least)
-            ]
+            fewer = []
+            for chosen, least in (_LEVER, LEVER_MIN_M), (_DELAY, least_s):
+                if not fit.free[chosen].all():
+                    continue
+                without = refitted(fit.free & ~np.isin(np.arange(5), chosen))
+                gain = 2 * len(fit.turns) * (self.cost(without, fit.std) - self.cost(fit, fit.std))
+                if gain < CERTAIN or np.linalg.norm(fit.theta[chosen]) < least:
+                    fewer.append(without)
             if not fewer:
                 break
-            fit = min(fewer, key=self.cost)
-            free = fit.free
+            fit = min(fewer, key=lambda fit: self.cost(fit, FAULT_M))
         return fit
 
     def faults(self, fit: _Fit | None) -> Mask:
@@ -331,12 +337,12 @@ class _Comparison:
             (sign, complex(np.exp(1j * (sign * self.yaw[fit.rows] - fit.yaw))[rows].mean()))
             for sign in (usual, -usual)
         ]
-        return both[1] if abs(both[1][1]) > max(abs(both[0][1]), ALIKE) else both[0]
+        return both[1] if abs(both[0][1]) < ALIKE < abs(both[1][1]) else both[0]
 
-    def cost(self, fit: _Fit) -> float:
+    def cost(self, fit: _Fit, std: float) -> float:
         """Negative log-likelihood of a sample, with its heading if the truth has any."""
         alike = abs(self.facing(fit)[1])
-        return fit.cost + ((1 - alike) / ASIDE**2 if alike > ALIKE else 0.0)
+        return fit.cost(std) + ((1 - alike) / ASIDE**2 if alike > ALIKE else 0.0)
 
     def headings(self, fit: _Fit) -> tuple[Array, str, bool]:
         """Headings (N,) rad of base_link, with a sentence on what was corrected of those of the
