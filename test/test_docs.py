@@ -140,7 +140,7 @@ def test_the_table_of_topics_is_that_of_the_nodes(bench, monkeypatch):
 
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
     nodes = [
-        bench.run(omnicam_node.OmnicamNode, camera_model='panorama', level_by_imu=True),
+        bench.run(omnicam_node.OmnicamNode, level_by_imu=True),
         bench.run(sfa_node.SfaNode, model='model.npz'),
         bench.run(ekf_node.EkfNode),
     ]

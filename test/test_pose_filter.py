@@ -15,9 +15,10 @@ from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.ekf import Ekf, with_delay
-from sfa_localization.fusion.motion import DELAY, LOSS, SCALE, SIZE
+from sfa_localization.fusion.motion import DELAY, LOSS, SCALE, SIZE, Pace, Twist
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.status import uncertainty
 
 either = pytest.mark.parametrize('heading', [True, False])
 
@@ -58,6 +59,23 @@ def test_prediction_to_a_stamp_recalls_and_extrapolates_less_and_less_sure():
     assert all(a.position_std < b.position_std for a, b in itertools.pairwise(later))
     # It does not run on for ever at the last speed.
     assert np.isfinite(later[-1].covariance).all() and later[-1].pose[0] < 6.5
+
+
+def test_without_odometry_the_estimate_gets_uncertain_as_this_robot_was_seen_to_drive():
+    lost_after_s = []
+    for turn, seconds in ((0.3, 40), (3.0, 40), (0.3, 1)):
+        drive = FilterDrive(twists=winding(seconds, 20, turn=turn), rate_hz=20, **NOISY)
+        fused = fed(started(), drive)
+        states = [fused.at(fused.state.stamp_ns + later * SECOND) for later in range(30)]
+        lost = [later for later, s in enumerate(states) if uncertainty(s, fused.config)]
+        assert lost == list(range(lost[0], 30)), 'it never gets more certain'
+        lost_after_s.append(lost[0])
+    assert lost_after_s[0] > 3 > lost_after_s[1] and lost_after_s[2] <= 2, lost_after_s
+    pace, robot = Pace(), winding(20, 20)
+    for k, twist in enumerate(robot.tolist()):
+        pace = pace.after(k * SECOND // 20, Twist(*twist, 0.0, 0.0))
+    changes = np.mean((robot[20:] - robot[:-20])[::20] ** 2, axis=0)
+    assert np.allclose(pace.changes, (changes * 19 + 1.0) / 20, rtol=0.01)
 
 
 def test_a_forgotten_pose_may_be_anywhere_and_what_was_learned_of_the_robot_stays():

@@ -100,8 +100,8 @@ class CameraConfig(Settings):
     camera_model: str = setting(
         '',
         'camera without a calibration_file: mirror (that of the simulator), equirectangular, or '
-        'panorama (the image is a panorama already); empty: none, then only images at least 3.5 '
-        'times as wide as high are used, as panoramas',
+        'panorama (the image is a panorama already); empty: none, then images at least 3.5 times '
+        'as wide as high are used, as panoramas, and live those that camera_info describes',
         choices=('', 'mirror', *UNCALIBRATED),
     )
     calibration_file: str = setting(
