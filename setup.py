@@ -73,8 +73,8 @@ setup(
         'kilted': ['ros-kilted-rclpy[fastrtps]', 'ros-kilted-common-interfaces'],
         # The simulated garden of `simulate` and `demo`.
         'simulation': ['trimesh>=4.4', 'embreex>=2.17.7'],
-        # Images that are recorded or published as H.264 or H.265 video.
-        'video': ['av>=11.0'],
+        # Images that are H.264 or H.265 video; older ones do not notice a lost packet of H.265.
+        'video': ['av>=16.0'],
         # The reference engine of `train`, made of MDP's nodes.
         'mdp': ['MDP==3.6'],
         # colcon finds the test runner by this name.

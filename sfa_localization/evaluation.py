@@ -145,7 +145,7 @@ def evaluate(
     smoothed after the drive. Unusable images count as skipped observations. Raises BagError or
     DataError, also without ground truth.
     """
-    recipe = as_live(recipe or Recipe(), model.panorama)
+    recipe = as_live(recipe or Recipe(), model.panorama, model.mount_rpy)
     recipe, training_drives = replace(recipe, origin=model.origin), list[_Localized]()
     for path in align_bags:
         here = _with_topics_of(path, recipe)

@@ -189,11 +189,12 @@ class BagReport:
             facts['images'] = str(self.camera)
         if self.odometry is not None:
             area = max(map(hull_area, self.drives), default=0.0)
+            along = max(map(directions, self.drives), default=0)
             facts['drive'] = (
                 f'{self.length_m:.0f} m by {self.odometry_topic}, '
                 f'{len(self.places)} images over {area:.0f} m2, '
                 f'{spacing(self.places):.2f} m apart, '
-                f'along {_directions(self.drives)} of {SECTORS} directions'
+                f'along {along} of {SECTORS} directions'
             )
             stops_s = (stops(self.odometry) - self.odometry.stamps_ns[0]) * 1e-9
             stood = [f'stop {k} at {a:.1f} to {b:.1f} s' for k, (a, b) in enumerate(stops_s, 1)]
@@ -387,7 +388,11 @@ class _Survey:
     def _drive(self, stream: Stream) -> None:
         """Fill in the path, the tilt, and the comparison with images and gyroscope."""
         report, camera = self._report, self._report.camera
-        odometry = self._bag.to_odometry(stream, self._values[self._odometry])
+        try:
+            odometry = self._bag.to_odometry(stream, self._values[self._odometry])
+        except BagError as error:
+            report.lacks.append(str(error).removeprefix(f'{self._bag.path}: '))
+            return
         images = self._values.get(self._image, [])
         stamps = np.array([stamp for stamp, _ in images], np.int64)
         yaw = np.array([yaw for _, (yaw, _) in images], float)
@@ -477,11 +482,6 @@ def spacing(places: Array) -> float:
     return float(np.percentile(steps, 90)) if len(steps) else 0.0
 
 
-def _directions(drives: Sequence[Array]) -> int:
-    """The most directions that drives, each with a frame of its own, can have together."""
-    return min(sum(map(directions, drives)), SECTORS)
-
-
 def directions(places: Array) -> int:
     """Number of directions that have at least MIN_SHARE of the path through places (N, >= 2)."""
     steps = np.diff(places[:, :2], axis=0)
@@ -556,7 +556,8 @@ def lacks_of_drives(drives: Sequence[Array], config: InspectionConfig) -> Iterat
     """What drives with images at places (M, 3) lack together, each with its remedy.
 
     Each drive has a frame of its own, and how they lie to each other is unknown before training:
-    only what the best arrangement lacks is named.
+    only what the best arrangement lacks is named. One drive may cross the lanes of another: those
+    of two days, along and across, gave a map of 0.06 m.
     """
     used = sum(map(len, drives))
     if 0 < used < config.min_pictures:
@@ -568,9 +569,9 @@ def lacks_of_drives(drives: Sequence[Array], config: InspectionConfig) -> Iterat
         return
     covered = [hull_area(places) * covered_share(places, config.reach) for places in areas]
     yield from sparse_lanes(sum(covered) / max(map(hull_area, areas)), config.reach)
-    if _directions(areas) < MIN_DIRECTIONS:
+    if len(areas) == 1 and directions(areas[0]) < MIN_DIRECTIONS:
         yield (
-            f'driven along {_directions(areas)} of {SECTORS} directions: '
+            f'driven along {directions(areas[0])} of {SECTORS} directions: '
             'cross the area lengthwise, crosswise and diagonally'
         )
 

@@ -70,7 +70,8 @@ class PlaceModel:
     of merit of the training, `error_correlation` that of neighboring images, `rig` the robot, and
     `ground` where it drove. Map and keyframes hold places of the camera. The map reads `turned`
     maps, or slow features where there are none. Where the robot hides its view, pixels (H, W)
-    repeat those of `repeated`.
+    repeat those of `repeated`. `mount_rpy`, degrees, are the angles of a camera that gives
+    panoramas, by which these were resampled; () if they were not.
     """
 
     network: Network
@@ -83,6 +84,7 @@ class PlaceModel:
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
     rig: Rig = field(default_factory=Rig)
     repeated: Indices | None = None
+    mount_rpy: tuple[float, ...] = ()
 
     def locate(self, panorama: Image) -> Observation:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
@@ -203,6 +205,7 @@ class PlaceModel:
             'quality': self.quality,
             'error_correlation': dataclasses.asdict(self.error_correlation),
             'rig': self.rig.to_mapping(),
+            'mount_rpy': self.mount_rpy,
         }
 
     def _arrays(self) -> Arrays:
@@ -234,6 +237,7 @@ class PlaceModel:
             ErrorCorrelation(**header['error_correlation']),
             Rig.from_mapping(header['rig']),
             arrays.get('repeated'),
+            tuple(header.get('mount_rpy', ())),
         )
 
 

@@ -136,6 +136,7 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     quality |= {'origin': origin} if (origin := given.runs[-1].origin) else {}
     quality |= {'segments': len(segments), **images.quality, **result.quality}
     quality |= keyframe_map.quality
+    unwrapper = Unwrapper(given.recipe.camera, given.panorama)
     rig = rig_of(given.drives, segments)
     drive = np.concatenate([np.full(len(segment.images), segment.run) for segment in segments])
     model = PlaceModel(
@@ -148,6 +149,7 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         quality,
         keyframe_map.correlation,
         rig,
-        repeated=Unwrapper(given.recipe.camera, given.panorama).repeated,
+        repeated=unwrapper.repeated,
+        mount_rpy=unwrapper.mount_rpy,
     )
     return Trained(model, given.runs, images.slow, segments, result)

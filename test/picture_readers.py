@@ -58,6 +58,10 @@ class PictureReader:
     error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
     rig: Rig = dataclasses.field(default_factory=Rig)
     ground: DrivenGround = dataclasses.field(default_factory=lambda: DROVE)
+    mount_rpy: tuple[float, ...] = ()
+
+    def masked(self, images):
+        return images
 
     def views(self, images):
         return images

@@ -209,7 +209,6 @@ def test_a_bag_recorded_while_the_nodes_ran_is_read_by_its_inputs(tmp_path):
 def test_faulty_messages_are_skipped_and_counted(tmp_path):
     """Other faults of images: test_pictures.py."""
     bad = [
-        ('/odom', stamp(1) + 1, odometry(stamp(1) + 1, math.nan, 0.0, 0.0)),
         ('/odom', stamp(2) + 1, odometry(stamp(2) + 1, 0.0, 0.0, 0.0, v=math.inf)),
         ('/camera', stamp(2) + 7, picture(stamp(2) + 7, encoding='rgb9')),
         ('/camera', stamp(2) + 8, picture(stamp(2) + 8, height=2, data=np.zeros(120, np.uint8))),
@@ -218,7 +217,7 @@ def test_faulty_messages_are_skipped_and_counted(tmp_path):
     run = read_drive(path, tmp_path)
     for use, reasons in {
         'images': ("unsupported encoding 'rgb9'", 'size is not 20x4 like the first image'),
-        'odometry': ('pose is not finite', 'twist is not finite'),
+        'odometry': ('twist is not finite',),
     }.items():  # fmt: skip
         told = {'used': COUNT, 'skipped': dict.fromkeys(reasons, 1)}
         assert run.counts[use].as_dict() == told

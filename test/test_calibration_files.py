@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ import yaml
 
 from sfa_localization.camera.calibration_files import (
     calibration_of,
+    calibration_of_info,
     calibration_text,
     read_calibration,
 )
@@ -191,3 +194,11 @@ def test_unusable_files_are_named_with_the_reason(tmp_path):
         read_calibration(tmp_path / 'missing.yaml')
     with pytest.raises(ConfigError, match=r'distortion: 1e.300 is outside'):
         LensCalibration(distortion=(1e300, 1.0, 1.0))
+
+
+def test_a_camera_info_of_a_part_of_the_image_is_that_of_the_part():
+    roi = SimpleNamespace(x_offset=100, y_offset=40, width=640, height=640)
+    fields = {'width': 848, 'height': 800, 'k': MATRIX, 'd': [0.0] * 5, 'roi': roi}
+    lens = calibration_of_info(SimpleNamespace(distortion_model='plumb_bob', **fields))
+    assert (lens.camera_model, lens.xi, lens.axis) == ('mirror', 0.0, 'forward'), 'a pinhole'
+    assert (lens.cx, lens.cy, lens.image_width, lens.image_height) == (324.0, 360.0, 640, 640)

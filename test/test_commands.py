@@ -214,6 +214,12 @@ def test_every_option_has_a_case_and_every_case_an_option():
     assert listed == options, 'a new option needs a case in CASES'
 
 
+def test_a_model_that_is_replaced_is_named(data, tmp_path):
+    shutil.copy(data / 'model.npz', tmp_path / 'model.npz')
+    made = run('train', BASE['train'], tmp_path, data=data)
+    assert 'model.npz: written, the model that was there is replaced' in made.text
+
+
 @pytest.mark.parametrize('name', cli.COMMANDS)
 def test_each_option_alone_has_its_effect(name, data, tmp_path):
     if name in ('play', 'demo'):

@@ -215,6 +215,33 @@ def test_reset_and_pause(bench):
     assert until(lambda: node.status().level.name == 'LOCALISED')
 
 
+def test_two_publishers_of_odometry_and_one_without_poses_are_named(bench):
+    drive = FilterDrive(seconds=1.2, **NOISY)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
+    odometries, logged = bench.listen(Odometry, 'ekf/odometry'), mock.Mock()
+    with mock.patch.object(node, 'get_logger', return_value=logged):
+        second = bench.node.create_publisher(Odometry, 'odom', 1000)
+        assert until(lambda: node.count_publishers('/odom') == 1)
+        for number, event in enumerate(part(drive, end=1.0, kinds=[0])):
+            topic, message = message_of(drive, *event[1:])
+            message.pose.pose.position.x += 3.0 * (number % 2)
+            bench.publish_until(topic, message, lambda n=number: len(odometries) > n)
+        assert until(lambda: node.count_publishers('/odom') == 2)
+        text = 'two publishers on /odom: stop one, or take another topic by odom:='
+        assert text in node.health()[1] and node.status().level.name == 'DEGRADED'
+        assert text in str(logged.warning.mock_calls)
+        bench.do(bench.node.destroy_publisher, second)
+        assert until(lambda: text not in node.health()[1])
+        transforms = bench.listen(TransformStamped, 'ekf/map_to_odom')
+        for event in part(drive, 1.0, kinds=[0]):
+            number += 1
+            topic, message = message_of(drive, *event[1:])
+            message.pose.pose.orientation = Quaternion(w=0.0)
+            bench.publish_until(topic, message, lambda n=number: len(odometries) > n)
+        assert 'its pose is not filled' in str(logged.warning.mock_calls)
+    assert near(pose_of(odometries[-1]), drive.poses[-1], 0.2) and transforms == []
+
+
 TWIST, TURNED, PLACED = 'twist.twist', 'pose.pose.orientation', 'pose.pose.position'
 MALFORMED = [
     ('odom', f'{TWIST}.linear.x', math.nan), ('odom', f'{TWIST}.angular.z', 1e200),

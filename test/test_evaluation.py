@@ -109,16 +109,16 @@ def test_what_the_filter_rejected_and_how_long_it_was_sure_or_wrong_is_printed(
 
 
 def test_what_was_corrected_of_the_truth_is_said_and_headings_it_lacks_are_not_judged(
-    bag, tmp_path, monkeypatch, capsys
+    bag, tmp_path, monkeypatch, capsys, caplog
 ):
     poses = TruePoses(read_truth(bag), False, ('ground truth has no headings',))
     monkeypatch.setattr(evaluation, 'true_poses', lambda *_: poses)
     figures = evaluated(bag, tmp_path, align='none')
-    said, warned = capsys.readouterr()
+    said = capsys.readouterr().out
     assert figures['corrections'] == ['drive: ground truth has no headings']
     assert 'drive: ground truth has no headings' in said and 'heading error' not in said
     assert figures['ekf']['yaw_deg'] is None and figures['ekf']['mean'] < 0.1
-    assert 'has no measured points, so that its coordinates are its own' in warned
+    assert 'has no measured points, so that its coordinates are its own' in caplog.text
 
 
 def spread_out(seed, covariance, count=4000):

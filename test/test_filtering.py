@@ -103,7 +103,7 @@ def test_disorder_is_sorted_and_bad_rows_are_counted(tmp_path):
            '1700000000000000000,1,1', '1e999999,1,1']  # fmt: skip
     odometry.write_text('\n'.join([head, *rows[:50], *bad, *rows[50:], rows[0], '', '']))
     table = read_table(odometry, ODOMETRY)
-    assert len(table.stamps_ns) == len(drive.stamps_ns) + 1 and len(table.skipped) == len(bad)
+    assert len(table.stamps_ns) == len(drive.stamps_ns) + 1 and table.skipped == (*range(52, 60),)
     assert np.all(np.diff(table.stamps_ns) >= 0)
     done = run_filter(table, read_table(positions, POSITIONS), STARTED)
     assert done.counts['odometry: duplicate stamp'] == 1

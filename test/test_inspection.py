@@ -56,7 +56,9 @@ def cross(share):
     return tuple(np.interp(share * driven[-1], driven, axis) for axis in stops)
 
 
-def write(path, route=star, pictures=400, shape=(8, 60), brightness=120, until=1.0, speed=1.0):
+def write(
+    path, route=star, pictures=400, shape=(8, 60), brightness=120, until=1.0, speed=1.0, body=()
+):
     """Record a drive along a route with a picture every 0.2 s, which turns with the robot."""
     rng = np.random.default_rng(0)
     around = rng.integers(0, 2 * brightness + 1, (shape[0], 360, 3), np.uint8)
@@ -69,6 +71,8 @@ def write(path, route=star, pictures=400, shape=(8, 60), brightness=120, until=1
             view = turned if shape[1] > 4 * shape[0] else turned[:, :90]
             picture = cv2.resize(view, shape[::-1], interpolation=cv2.INTER_AREA)
             picture[0] = rng.integers(0, 2 * brightness + 1, (shape[1], 3), np.uint8)
+            for top, left, right, color in body:
+                picture[top:, left:right] = color
             bag.image('/panorama', at, picture, 'camera')
             if share <= until:
                 bag.odometry('/odom', at, (*route(share), heading), (speed, 0.0), (0.0, 0.0))
@@ -157,6 +161,32 @@ def test_several_bags_are_judged_together(tmp_path, capsys):
 def test_a_single_route_is_enough_for_a_model_of_the_route(route, tmp_path):
     report = inspect(write(tmp_path / 'bag', route=route), config=ENOUGH)
     assert report.lacks == [] and ROUTE in report.notes
+
+
+STRIPES = np.random.default_rng(5).integers(0, 256, (12, 1, 3), np.uint8)
+
+
+@pytest.mark.parametrize(('parts', 'said'), [
+    ([(0, 20, 40, STRIPES)], 'blind_sectors: [294.0, 66.0]'),
+    ([(0, 0, 10, 90), (0, 50, 60, 90)], 'blind_sectors: [114.0, 246.0]'),
+    ([(0, 0, 6, 0), (0, 30, 34, STRIPES)], 'blind_sectors: [330.0, 6.0, 120.0, 204.0]'),
+    ([(6, 10, 25, 40)], 'the lower 50% of the view from 24 to 126 degrees'),
+    ([], ''),
+])  # fmt: skip
+def test_what_stays_the_same_while_the_robot_turns_is_the_robot(parts, said, tmp_path):
+    """Its azimuths are named with a column more on both sides, of 6 degrees here; beside a black
+    part the contrast of two more columns is that of the edge.
+    """
+    report = inspect(write(tmp_path / 'bag', shape=(12, 60), body=parts), config=ENOUGH)
+    text = report.as_text()
+    assert said in text and ('shows the robot' in text) == bool(said)
+    assert ('        blind_sectors: [' in text) == ('blind_sectors' in said)
+
+
+def test_of_a_robot_that_hardly_turns_nothing_is_said(tmp_path):
+    """Then all that is far away stays the same."""
+    route = {'route': lambda share: (30 * share, 2 * share), 'body': [(0, 20, 40, STRIPES)]}
+    assert inspect(write(tmp_path / 'bag', shape=(12, 60), **route), config=ENOUGH).bodies == []
 
 
 def test_only_places_that_are_seen_again_in_other_headings_show_where_the_camera_sits():

@@ -139,6 +139,22 @@ def drive_of(run, odometry):
     return Drive(Run('drive', images, odometry), run.poses[:, 2].tolist())
 
 
+def test_points_of_an_antenna_are_placed_beside_base_link():
+    """At stamps between images, in turns too."""
+    odometry, run, _ = world()
+    antenna = -0.4 + 0.3j
+    stamps = run.stamps_ns[5:-5:40] + 60_000_000
+    poses = odometry.trajectory.at(stamps)
+    places = (poses[:, 0] + 1j * poses[:, 1] + antenna * np.exp(1j * poses[:, 2])).tolist()
+    rows = zip(stamps.tolist(), places, strict=True)
+    given = Points.of([('fix', *row, STD, antenna) for row in rows])
+    drives = [(odometry, run.stamps_ns)]
+    measured = MeasuredPoints.of(given, drives, np.arange(len(run.poses)))
+    near = odometry.trajectory.at(run.stamps_ns[measured.images])
+    beside = near[:, 0] + 1j * near[:, 1] + measured.offset * np.exp(1j * near[:, 2])
+    np.testing.assert_allclose(beside, places, atol=1e-9)
+
+
 @functools.cache
 def learned(rows=(), wrong=None):
     """Segments and the map of the world by points at some images, and by offsets."""

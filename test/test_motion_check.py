@@ -171,6 +171,58 @@ def test_a_gyroscope_is_corrected(sample, factor, late_s, texts):
     assert np.abs(run.yaw_rate.omega - expected)[60:-60].max() < 0.05
 
 
+def held(rate: np.ndarray, rng) -> np.ndarray:
+    """Rates of which one is held for two seconds, after six that are right."""
+    rows = np.arange(len(rate))
+    return rate[np.where(rows % 200 < 150, rows, rows - rows % 200 + 150)]
+
+
+RATES = {
+    'zeros': (lambda w, rng: np.where(rng.random(len(w)) < 0.2, 0.0, w), (140, 160), True),
+    'spikes': (lambda w, rng: np.where(rng.random(len(w)) < 0.01, 30.0, w), (5, 12), True),
+    'small spikes': (lambda w, rng: np.where(rng.random(len(w)) < 0.01, w - 5.0, w), (5, 12), True),
+    'held': (held, (100, 160), True),
+    'noise': (lambda w, rng: w + rng.normal(0.0, 0.02, len(w)), (0, 0), True),
+    'bias': (lambda w, rng: w + 0.02, (0, 0), True),
+    'half zeros': (lambda w, rng: np.where(rng.random(len(w)) < 0.5, 0.0, w), (0, 0), False),
+    'another range': (lambda w, rng: 0.8 * w, (0, 0), False),
+}
+
+
+@pytest.mark.parametrize('name', RATES)
+def test_rates_that_wheels_and_images_contradict_are_left_out(sample, name):
+    change, (least, most), stays = RATES[name]
+    right = sample.yaw_rate
+    recorded = replace(right, omega=change(right.omega, np.random.default_rng(0)))
+    run, check = checked(replace(sample, yaw_rate=recorded))
+    text = '; '.join(check.corrected)
+    assert ('messages contradict wheels and images' in text) == bool(most)
+    assert ('left out: the wheels agree better with the images' in text) != stays
+    if not stays:
+        assert run.yaw_rate is None
+        return
+    kept = run.yaw_rate
+    assert least <= len(right.omega) - len(kept.omega) <= most
+    of_kept = np.interp(kept.stamps_ns, right.stamps_ns, right.omega)
+    assert np.median(np.abs(kept.omega - of_kept)) < 0.03
+    assert np.abs(kept.omega - of_kept).max() < (0.7 if most else 0.1)
+
+
+def skidding(run: Run, where) -> Run:
+    """Whose wheels turn by 0.6 rad/s more there."""
+    odometry = run.odometry
+    twists = odometry.twists + np.outer(where(np.arange(len(odometry.twists))), [0.0, 0.6])
+    poses = integrate(odometry.stamps_ns, twists)
+    return replace(run, odometry=replace(odometry, twists=twists, poses=poses))
+
+
+@pytest.mark.parametrize('where', [lambda i: i // 25 % 5 == 0, lambda i: (i > 200) & (i < 240)])
+def test_wheels_that_skid_now_and_then_do_not_condemn_the_gyroscope(sample, where):
+    run, check = checked(skidding(sample, where))
+    assert np.array_equal(run.yaw_rate.omega, sample.yaw_rate.omega)
+    assert not any('gyroscope' in text for text in check.corrected)
+
+
 def test_a_gyroscope_of_another_motion_or_epoch_is_left_out(sample):
     noise = gyro(sample, np.random.default_rng(0).normal(size=len(sample.yaw_rate.omega)))
     for recorded, text in ((noise, 'left out'), (gyro(sample, late_s=1e6), 'another clock')):

@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from filter_drives import SECOND, START_NS, FilterDrive, from_rest, started, winding
 
+from sfa_localization.bags.motion_arrays import to_odometry
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import compose, invert
 from sfa_localization.data.odometry_steps import beyond
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import Trajectory
@@ -123,6 +126,103 @@ def test_a_clock_that_is_set_ahead_is_followed_from_the_third_message_on():
         drive.give(fused, (stamp_ns + later_ns, kind, index), heading=True)
     assert fused.state.stamp_ns == int(drive.stamps_ns[-1]) + round(3e5 * SECOND)
     assert drive.error(fused, -1)[0] < 0.1
+
+
+# Messages beside the path, and messages without pose.
+
+
+def values_of(drive, poses, twists):
+    """The messages of a bag's topic."""
+    rows = zip(drive.stamps_ns.tolist(), poses.tolist(), twists.tolist(), strict=True)
+    return [(stamp_ns, (pose, (*twist, 4e-4, 1e-4))) for stamp_ns, pose, twist in rows]
+
+
+def changed(poses, twists, where, pose, twist):
+    """With another pose and twist in some messages; None: as it is."""
+    poses, twists = poses.copy(), twists.copy()
+    if pose is not None:
+        poses[where] = pose
+    if twist is not None:
+        twists[where] = twist
+    return poses, twists
+
+
+IN_TURN = {
+    'one each': (lambda i: i % 2 == 1, 2.0 + 1.0j, 0.7),
+    'two each': (lambda i: i % 4 > 1, 0.3j, 0.1),
+    'one is slower': (lambda i: i % 7 == 3, -3.0, 3.0),
+    'by chance': (lambda i: np.random.default_rng(0).random(len(i)) < 0.5, 1.0, -1.5),
+}
+
+
+@pytest.mark.parametrize('name', IN_TURN)
+def test_two_publishers_in_turn_are_named_and_not_believed(name):
+    chosen, shift, turn = IN_TURN[name]
+    drive = FilterDrive(twists=winding(20, 25.0, speed=0.4), rate_hz=25)
+    z = shift + (drive.reckoned[:, 0] + 1j * drive.reckoned[:, 1]) * np.exp(1j * turn)
+    other = np.column_stack([z.real, z.imag, drive.reckoned[:, 2] + turn])
+    poses = np.where(chosen(np.arange(len(z)))[:, None], other, drive.reckoned)
+    with pytest.raises(DataError, match=r'two publishers on /wheels: .*; stop one, or record each'):
+        to_odometry(values_of(drive, poses, drive.read), '/wheels')
+    outputs = fused_over(poses, drive.read, drive)
+    assert max(error for t, error, *_ in outputs if t > 3.0) < 0.05
+    assert outputs[-1][2] is Level.DEGRADED and 'along two paths in turn' in outputs[-1][3][0]
+
+
+NAN = np.full(3, np.nan)
+FAULTS = {
+    'all zeros': ([0.0, 0.0, 0.0], [0.0, 0.0], 'pose beside the path'),
+    'pose of zeros': ([0.0, 0.0, 0.0], None, 'pose beside the path'),
+    'pose elsewhere': ([7.0, -3.0, 1.0], None, 'pose beside the path'),
+    'also the quaternion': (NAN, [0.0, 0.0], 'neither pose nor twist'),
+}
+
+
+@pytest.mark.parametrize('name', FAULTS)
+def test_single_faulty_messages_are_left_out_and_counted(name):
+    pose, twist, reason = FAULTS[name]
+    drive = FilterDrive(twists=winding(20, 25.0, speed=0.4), rate_hz=25, start=(1.0, 1.0, 0.0))
+    where = np.arange(len(drive.stamps_ns)) % 40 == 30
+    right = drive.reckoned + np.array([1.0, 2.0, 0.0])
+    poses, twists = changed(right, drive.read, where, pose, twist)
+    odometry, said, faults = to_odometry(values_of(drive, poses, twists), '/odom')
+    assert np.array_equal(odometry.poses, right[~where]) and faults == {reason: where.sum()}
+    assert said == [f'{where.sum()} of {len(where)} messages left out: {reason}']
+    fused = started(drive.start)
+    for stamp_ns, each, of_pose in zip(
+        drive.stamps_ns.tolist(), twists.tolist(), poses, strict=True
+    ):
+        fused.add_odometry(stamp_ns, *each, (4e-4, 1e-4), of_pose)
+    assert fused.counts[f'odometry: {reason}'] == where.sum()
+    assert math.dist(fused.state.pose[:2], drive.poses[-1, :2]) < 0.02
+
+
+@pytest.mark.parametrize('share', [1.0, 0.3])
+def test_where_no_pose_is_filled_the_twist_is_used(share):
+    drive = FilterDrive(twists=winding(20, 25.0, speed=0.4), rate_hz=25)
+    where = np.random.default_rng(0).random(len(drive.stamps_ns)) < share
+    poses, twists = changed(drive.reckoned, drive.read, where, NAN, None)
+    odometry, said, _ = to_odometry(values_of(drive, poses, twists), '/odom')
+    moved = compose(invert(odometry.poses[0]), odometry.poses[-1])
+    assert np.allclose(moved, compose(invert(drive.reckoned[0]), drive.reckoned[-1]), atol=0.01)
+    text = f'{where.sum()} of {len(where)} messages have no pose (NaN, or a quaternion of zeros)'
+    assert [each.split(';')[0] for each in said] == [text]
+    outputs = fused_over(poses, drive.read, drive, images=False)
+    assert max(error for _, error, *_ in outputs) < 0.02
+    with pytest.raises(DataError, match='neither poses nor twists'):
+        to_odometry(values_of(drive, drive.reckoned * np.nan, 0 * twists), '/odom')
+
+
+def test_poses_that_are_noisy_or_repeated_or_jump_are_of_one_publisher():
+    drive = FilterDrive(twists=winding(20, 25.0, speed=1.0), rate_hz=25)
+    rng, rows = np.random.default_rng(0), np.arange(len(drive.stamps_ns))
+    noise = rng.normal(0.0, 0.1, (len(rows), 3)) * [1.0, 1.0, 0.3]
+    for poses in (
+        drive.reckoned + noise, drive.reckoned[rows // 4 * 4], jumped(drive.reckoned, 251, 0.6),
+        np.round(drive.reckoned, 1),
+    ):  # fmt: skip
+        for twists in (drive.read, 0 * drive.read, -drive.read):
+            assert to_odometry(values_of(drive, poses, twists), '/odom')[1:] == ([], {})
 
 
 # Stamps.

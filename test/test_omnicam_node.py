@@ -31,7 +31,7 @@ from geometry_msgs.msg import Quaternion
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from ros_bench import until
-from sensor_msgs.msg import CompressedImage, Image, Imu
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_msgs.msg import String
 
 from sfa_localization.camera.video import ImageReader
@@ -189,6 +189,38 @@ def test_nobody_listens_nothing_is_done(bench):
         assert until(lambda: node.count_subscribers('image_raw') == 0)
 
 
+FISHEYE = LensCalibration(
+    camera_model='fisheye', fx=200.0, fy=200.0, distortion=(0.1, 0.0, 0.0, 0.0), radius_min=0.0,
+    radius_max=0.0,
+)  # fmt: skip
+
+
+def camera_info(model='equidistant', focal=200.0, coefficients=FISHEYE.distortion):
+    k = [focal, 0.0, 319.5, 0.0, focal, 319.5, 0.0, 0.0, 1.0]
+    return CameraInfo(width=640, height=640, distortion_model=model, k=k, d=coefficients)
+
+
+@pytest.mark.parametrize(('rule', 'images', 'infos'), [
+    ('__node:=omnicam_node', 'image_raw', 'camera_info'),
+    ('image_raw:=/front/image', '/front/image', '/front/camera_info'),
+    ('camera_info:=/calibration', 'image_raw', '/calibration'),
+])  # fmt: skip
+def test_camera_info_beside_the_images_describes_the_camera(bench, rule, images, infos):
+    """The first that can be used; one that cannot is refused with the remedy."""
+    given = {'cli_args': ['--ros-args', '-r', rule]}
+    node = bench.run(OmnicamNode, options=given, **SMALL | {'camera_model': ''})
+    heard, monitor = bench.listen(Image, 'panorama'), node.monitors['camera_info']
+    wrong = camera_info('fov'), camera_info('rational_polynomial', 200.0, [0.1] * 8)
+    for number, bad in enumerate([*wrong, camera_info(focal=0.0)], 1):
+        assert bench.publish_until(infos, bad, lambda n=number: len(monitor.refused) == n)
+    assert all(why.endswith('by a calibration_file') for why in monitor.refused)
+    assert bench.publish_until(infos, camera_info(), lambda: monitor.used)
+    assert bench.publish_until(infos, camera_info(focal=90.0), lambda: len(monitor.refused) == 4)
+    expected = Unwrapper(CameraConfig(), PANORAMA, FISHEYE)(raw_picture())
+    np.testing.assert_array_equal(pixels(answer(bench, heard, message(), images)), expected)
+    assert node.health()[2]['camera model'] == 'fisheye'
+
+
 def test_it_outlives_every_bad_image_and_counts_each(bench):
     """What is wrong with images is tested in test_pictures.py."""
     node, heard = start(bench)
@@ -224,6 +256,18 @@ def test_masks_elevation_and_mount_change_while_running_and_are_declared(bench):
     assert until(lambda: np.array_equal(pixels(answer(bench, heard, message())), expected))
 
 
+def test_panoramas_of_the_camera_are_mounted_and_masked(bench):
+    """Also those that need no description."""
+    given = {'camera_model': '', 'blind_sectors': [100.0, 140.0], 'mount_rpy': [5.0, 0.0, 30.0]}
+    _, heard = start(bench, **given)
+    camera = CameraConfig(**{k: tuple(v) if k != 'camera_model' else v for k, v in given.items()})
+    strip = raw_picture()[:120]
+    panorama = answer(bench, heard, to_image(strip, STAMP_NS, 'camera'))
+    expected = Unwrapper(camera, PANORAMA)(strip)
+    np.testing.assert_array_equal(pixels(panorama), expected)
+    assert not np.array_equal(expected, Unwrapper(CameraConfig(), PANORAMA)(strip))
+
+
 def with_rules(*rules):
     return {'cli_args': ['--ros-args', *(word for rule in rules for word in ('-r', rule))]}
 
@@ -235,6 +279,8 @@ def test_impossible_cameras_do_not_start_and_impossible_changes_are_rejected(ben
     for parameters, words in (
         ({'calibration_file': 'nowhere.yaml'}, 'nowhere.yaml'),
         ({'elevation_min': 60.0, 'elevation_max': 80.0}, 'sees no part'),
+        ({'camera_model': '', 'mask_file': 'nowhere.png'}, 'mask_file is missing'),
+        ({'camera_model': '', 'blind_sectors': [-180.0, 180.0]}, 'sees no part'),
         (loop, 'which this node itself publishes: remap'),
         ({'image_transport': 'ffmpeg'}, 'apt install ros-$ROS_DISTRO-ffmpeg-image-transport-msgs'),
     ):

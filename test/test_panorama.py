@@ -13,7 +13,7 @@ from rosbags.typesys import Stores
 from test_cameras import CAMERAS
 
 from sfa_localization.bags.decoding import typestore
-from sfa_localization.bags.drives import ReadingRecipe, read_drive
+from sfa_localization.bags.drives import ReadingRecipe, as_live, read_drive
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama, panorama_rays
@@ -186,6 +186,7 @@ def test_a_panorama_that_the_camera_gives_is_mounted_and_masked(model, clockwise
         unwrapper = Unwrapper(config, panorama)
         seen = unwrapper.visible(size)
         assert 0.7 < seen.mean() < 1.0 and unwrapper.repeated is not None
+        assert unwrapper.mount_rpy == mount
         tilted = picture_of(smooth, lens, size, mount)[:, order]
         assert psnr(unwrapper(tilted)[seen], direct(smooth, panorama)[seen]) > 30
         level = picture_of(smooth, lens, size)[:, order]
@@ -201,7 +202,8 @@ def test_a_panorama_that_the_camera_gives_is_mounted_and_masked(model, clockwise
             # A model masks again: nothing changes.
             again = result.reshape(-1, 3)[unwrapper.repeated]
             np.testing.assert_array_equal(again, result)
-    assert Unwrapper(CameraConfig(camera_model=model), panorama).repeated is None
+    untouched = Unwrapper(CameraConfig(camera_model=model), panorama)
+    assert untouched.repeated is None and untouched.mount_rpy == ()
 
 
 def test_recorded_panoramas_are_mounted_and_masked_in_their_size(tmp_path):
@@ -224,5 +226,7 @@ def test_recorded_panoramas_are_mounted_and_masked_in_their_size(tmp_path):
         run = read_drive(tmp_path / name, tmp_path, ReadingRecipe(camera=camera))
         np.testing.assert_array_equal(run.panoramas.read(0, 1)[0], expected)
         missing = ReadingRecipe(camera=CameraConfig(mask_file='nowhere.png'))
+        learned = as_live(ReadingRecipe(), PanoramaConfig(), camera.mount_rpy)
+        assert learned.camera.mount_rpy == camera.mount_rpy
         with pytest.raises(CameraError, match=r'mask_file is missing or is no image \(nowhere.png'):
             read_drive(tmp_path / name, tmp_path, missing)

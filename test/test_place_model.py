@@ -13,6 +13,8 @@ from cylinder_worlds import place, visit
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from sfa_localization import evaluation, training, updating
+from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.data.array_files import read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError, ModelError
@@ -20,6 +22,7 @@ from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.keyframes.light import Conditions
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE
 from sfa_localization.localizer import Localizer
+from sfa_localization.observer import Observer
 from sfa_localization.place_model import FORMAT, VERSION, PlaceModel
 
 
@@ -120,6 +123,25 @@ def test_a_model_is_the_same_after_it_was_saved(model, saved, pictures, tmp_path
     assert Localizer(again).filter.correlation.share == pytest.approx(again.error_correlation.share)
     again.save(tmp_path / 'again.npz')
     assert (tmp_path / 'again.npz').read_bytes() == saved.read_bytes()
+
+
+def test_a_model_masks_what_it_has_not_seen_in_training(model, pictures, tmp_path):
+    """Whoever gives it panoramas: masked or not, they show the same."""
+    camera = Unwrapper(CameraConfig(blind_sectors=(150.0, 210.0)), model.panorama)
+    masked = replace(model, repeated=camera.repeated, mount_rpy=(5.0, 0.0, 30.0))
+    masked.save(tmp_path / 'masked.npz')
+    masked = PlaceModel.load(tmp_path / 'masked.npz')
+    assert masked.mount_rpy == (5.0, 0.0, 30.0)
+    covered, blind = pictures[:2].copy(), ~camera.visible((1, 4))
+    covered[:, blind] = 200
+    expected = model.locate_all(np.stack([camera(picture) for picture in pictures[:2]]))
+    for given in (pictures[:2], covered):
+        stamps = np.arange(len(given))
+        for seen in (masked.locate_all(given), Observer(masked).observe_all(stamps, given)):
+            for one, other in zip(seen, expected, strict=True):
+                assert np.allclose(one.slow_features, other.slow_features, atol=1e-5)
+    with pytest.raises(ModelError, match='expects panoramas of'):
+        masked.locate(pictures[0, :, 12:])
 
 
 def test_what_is_no_model_is_refused_with_the_remedy(tmp_path):

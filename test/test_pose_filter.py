@@ -185,6 +185,34 @@ def test_turns_show_by_how_much_images_are_stamped_late(late_s):
         assert np.mean(errors[-500:]) < 0.15 and fused.status.level is Level.LOCALISED
 
 
+@pytest.mark.parametrize('ahead_s', [37, -18.0, -3600.5, 0.2])
+def test_an_offset_of_clocks_is_used_once_turns_confirm_it(ahead_s):
+    drive, fused = FilterDrive(seconds=90, rate_hz=25, every=4, **NOISY), PoseFilter()
+    fused.expect(Rig(camera_delay=Quantity(0.0, 0.05)))
+    for stamp_ns, kind, index in drive.events(stop=60):
+        if kind:  # images arrive 0.12 s late
+            shown = max(index - 1, 0)
+            stamp_ns = int(drive.stamps_ns[drive.pictures[shown]]) + round(ahead_s * SECOND)
+            fused.add_turned(stamp_ns, float(drive.poses[drive.pictures[shown], 2]))
+            update = drive.give(fused, (stamp_ns, 1, shown), True)
+        else:
+            drive.give(fused, (stamp_ns, 0, index))
+    assert fused.status.level is Level.LOCALISED and fused.status.reasons == ()
+    assert drive.error(fused, index)[0] < 0.2 and abs(update.stamp_ns - stamp_ns) < SECOND
+    said = [name for name in fused.counts if name.startswith('images: stamped')]
+    assert len(said) == (abs(ahead_s) > 1)
+
+
+def test_images_that_only_arrive_late_are_not_taken_for_those_of_another_clock():
+    drive, fused = FilterDrive(seconds=60, rate_hz=25, every=4, **NOISY), started()
+    events = sorted(drive.events(), key=lambda event: event[0] + event[1] * 8 * SECOND)
+    for stamp_ns, kind, index in events:
+        if kind:
+            fused.add_turned(stamp_ns, float(drive.poses[drive.pictures[index], 2]))
+        drive.give(fused, (stamp_ns, kind, index), True)
+    assert not any(name.startswith('images: stamped') for name in fused.counts)
+
+
 def test_a_delay_that_turns_contradict_gives_way_and_the_pose_follows():
     mean, covariance = np.zeros(SIZE), np.eye(SIZE)
     covariance[DELAY, DELAY] = covariance[0, DELAY] = covariance[DELAY, 0] = 0.05**2  # at 1 m/s

@@ -98,6 +98,22 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
     assert until(lambda: 'no image on /panorama for' in told[-1].status[0].message)
 
 
+def test_a_panorama_of_the_camera_itself_is_mounted_as_in_training(bench, models):
+    """That of omnicam_node, which declares it, is so already."""
+    models['a.npz'].mount_rpy = (0.0, 0.0, 90.0)
+    node = bench.run(SfaNode, model='a.npz')
+    poses = bench.listen(PoseStamped, 'sfa/pose')
+    turned = np.roll(panorama(PLACE, 1), SIZE.width // 4, axis=1)
+    bench.publish('panorama', message(image=turned))
+    assert until(lambda: len(poses) == 1)
+    bench.publish('panorama/info', declared(), latched_qos())
+    assert until(lambda: node.monitors['panorama/info'].used == 1)
+    bench.publish('panorama', message(seed=2))
+    assert until(lambda: len(poses) == 2)
+    for pose in (poses[0].pose, poses[-1].pose):
+        assert read_planar(pose.position, pose.orientation) == pytest.approx(PLACE, abs=1e-3)
+
+
 def test_an_unusable_image_gives_no_pose_and_is_reported(bench, models):
     node = bench.run(SfaNode, model='a.npz')
     poses = bench.listen(PoseStamped, 'sfa/pose')

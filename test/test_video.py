@@ -99,6 +99,15 @@ def test_images_after_a_lost_or_damaged_packet_wait_for_the_next_key_frame(codec
             assert read(received, format) == ({n: n for n in range(24) if n not in hidden}, reasons)
 
 
+def test_parameters_of_a_video_may_come_alone():
+    messages = []
+    for number, data in encoded(key_every=12):
+        start = data.find(b'\0\0\1\x65') if number % 12 == 0 else 0
+        messages += [(number, part) for part in (data[:start], data[start:]) if part]
+    shown, reasons = read(messages)
+    assert shown == {n: n for n in range(24)} and reasons == {video.NO_IMAGE: 2}
+
+
 def test_no_damage_raises_another_error():
     rng, packets = np.random.default_rng(0), encoded()
     for _ in range(30):

@@ -18,7 +18,7 @@ from rosbags.typesys.store import Typestore
 from sfa_localization.bags.files import Topic
 from sfa_localization.bags.satellite_fixes import fix_of
 from sfa_localization.data.errors import BagError, MessageError
-from sfa_localization.data.messages import read_planar, read_twist, require_sane
+from sfa_localization.data.messages import read_odometry, read_planar, require_sane
 
 IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 PACKET, VIDEO = 'ffmpeg_image_transport_msgs/msg/FFMPEGPacket', 'foxglove_msgs/msg/CompressedVideo'
@@ -132,5 +132,10 @@ def place_of(message: Any) -> tuple[float, float, float]:
 
 
 def odometry_of(message: Any) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
-    """Pose, and of an Odometry v, omega and their variances; other types have no twist."""
-    return pose_of(message), read_twist(message) if message.__msgtype__ == ODOMETRY else None
+    """Pose, NaN where an Odometry is not filled with one, and of an Odometry v, omega and their
+    variances; other types have no twist.
+    """
+    if message.__msgtype__ != ODOMETRY:
+        return pose_of(message), None
+    pose, twist = read_odometry(message)
+    return pose or (math.nan,) * 3, twist

@@ -70,12 +70,15 @@ class ReadingRecipe:
     origin: Origin | None = None
 
 
-def as_live(recipe: R, panorama: PanoramaConfig) -> R:
+def as_live(recipe: R, panorama: PanoramaConfig, mount_rpy: tuple[float, ...] = ()) -> R:
     """The recipe to read a drive with a model's panorama, as the nodes do: the filter also fuses
-    images far from any odometry.
+    images far from any odometry. Without angles of a mount in the recipe, `mount_rpy` is used.
     """
-    topics = replace(recipe.topics, points_topic='')
-    return replace(recipe, topics=topics, panorama=panorama, odometry_tolerance_s=0.0)
+    topics, camera = replace(recipe.topics, points_topic=''), recipe.camera
+    if mount_rpy and not any(camera.mount_rpy):
+        camera = replace(camera, mount_rpy=mount_rpy)
+    live = replace(recipe, topics=topics, camera=camera, panorama=panorama)
+    return replace(live, odometry_tolerance_s=0.0)
 
 
 def image_folder(output: Path) -> Path:

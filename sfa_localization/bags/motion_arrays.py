@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import Array, Mask, relative
+from sfa_localization.data.odometry_steps import IN_TURN, beside
 from sfa_localization.data.run import (
     POINT_STD_M,
     Odometry,
@@ -16,6 +19,7 @@ from sfa_localization.data.run import (
     Stamps,
     Trajectory,
     YawRate,
+    chained,
     differences,
     integrate,
 )
@@ -50,22 +54,65 @@ def to_points(values: StampedValues, lever: complex = 0j) -> Points:
     ])  # fmt: skip
 
 
-def to_odometry(values: StampedValues) -> tuple[Odometry, str]:
-    """Odometry, and a sentence on a peculiarity of it, or ''.
+def to_odometry(values: StampedValues, topic: str) -> tuple[Odometry, list[str], dict[str, int]]:
+    """Odometry of a topic, sentences on its peculiarities, and the count of faults by reason.
 
-    The values are a pose with v, omega and their variances, or with None where messages have only
-    poses: then twists are the differences of poses.
+    The values are a pose, NaN where it is not filled, with v, omega and their variances, or with
+    None where messages have only poses: then twists are the differences of poses. Raises DataError
+    for two publishers, and where nothing is filled.
     """
-    stamps = _stamps(values)
-    poses = np.array([pose for _, (pose, _) in values], float).reshape(-1, 3)
-    if not values or values[0][1][1] is None:
-        twists = differences(stamps, poses)
-        odometry = Odometry(stamps, poses, twists, np.zeros_like(twists))
-    else:
-        motion = np.array([twist for _, (_, twist) in values], float).reshape(-1, 4)
-        odometry = Odometry(stamps, poses, motion[:, :2], motion[:, 2:])
-    speeds = np.abs(odometry.twists[:, 0])
-    if len(stamps) > 1 and not np.ptp(poses, axis=0).any() and speeds.max() > _DRIVING_MPS:
-        integrated = replace(odometry, poses=integrate(stamps, odometry.twists))
-        return integrated, 'the pose is constant; the twist is integrated instead'
-    return odometry, ''
+    stamps, poses = _stamps(values), np.array([pose for _, (pose, _) in values], float)
+    poses, has_twist = poses.reshape(-1, 3), bool(values) and values[0][1][1] is not None
+    motion = [twist if has_twist else (0.0,) * 4 for _, (_, twist) in values]
+    rows = np.column_stack([poses, np.array(motion, float).reshape(-1, 4)])
+    empty = _empty(rows)
+    if len(rows) and empty.all():
+        raise DataError(f'{topic}: neither poses nor twists are filled')
+    aside = np.zeros(len(rows), bool)
+    posed = np.flatnonzero(np.isfinite(rows[:, 0]))
+    seconds = np.asarray((stamps[posed] - stamps[:1]) * 1e-9, float)
+    aside[posed], in_turn = beside(seconds, rows[posed, :3], rows[posed, 3:5])
+    if in_turn > IN_TURN:
+        raise DataError(
+            f'two publishers on {topic}: its messages lead along two paths in turn; stop one, or '
+            'record each on a topic of its own and choose one with --odom-topic'
+        )
+    kept = ~(empty | aside)
+    stamps, (poses, twists, variances) = stamps[kept], np.split(rows[kept], (3, 5), axis=1)
+    if not has_twist:
+        twists, variances = differences(stamps, poses), np.zeros((len(stamps), 2))
+    odometry, oddity = _filled(Odometry(stamps, poses, twists, variances))
+    counts = {'neither pose nor twist': int(empty.sum()), 'pose beside the path': int(aside.sum())}
+    faults = {reason: count for reason, count in counts.items() if count}
+    said = [f'{n} of {len(rows)} messages left out: {why}' for why, n in faults.items()]
+    return odometry, [*said, oddity] if oddity else said, faults
+
+
+def _empty(rows: Array) -> Mask:
+    """Which messages (N, 7) of neither pose nor twist show nothing: those of a robot that stands
+    do, where other messages have a twist and no pose either.
+    """
+    posed, moves = np.isfinite(rows[:, 0]), rows[:, 3:5].any(axis=1)
+    alone = np.append(False, posed[:-1]) & np.append(posed[1:], False)
+    return np.asarray(~posed & ~moves & (alone | ~moves.any()))
+
+
+def _filled(odometry: Odometry) -> tuple[Odometry, str]:
+    """Odometry with poses integrated from the twist where there are none, and a sentence on that;
+    '' for none.
+    """
+    stamps, poses, twists = odometry.stamps_ns, odometry.poses, odometry.twists
+    lacks, drives = np.isnan(poses[:, 0]), np.abs(twists[:, 0]).max(initial=0) > _DRIVING_MPS
+    by_twist = integrate(stamps, twists)
+    if not lacks.any():
+        constant = len(stamps) > 1 and drives and not np.ptp(poses, axis=0).any()
+        text = 'the pose is constant; the twist is integrated instead'
+        return (replace(odometry, poses=by_twist), text) if constant else (odometry, '')
+    step, integrated = relative(poses[:-1], poses[1:]), relative(by_twist[:-1], by_twist[1:])
+    step = np.where(np.isnan(step[:, :1]), integrated, step)
+    start = np.zeros(3) if lacks[0] else poses[0]
+    text = (
+        f'{lacks.sum()} of {len(stamps)} messages have no pose (NaN, or a quaternion of zeros); '
+        'the twist is integrated instead'
+    )
+    return replace(odometry, poses=chained(start, step)), text

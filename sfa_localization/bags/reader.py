@@ -23,7 +23,7 @@ from sfa_localization.bags.satellite_fixes import in_plane
 from sfa_localization.bags.settings import BagConfig
 from sfa_localization.bags.topic_stream import Item, Stream
 from sfa_localization.camera.video import ImageReader
-from sfa_localization.data.errors import BagError, LocalizationError, MessageError
+from sfa_localization.data.errors import BagError, DataError, LocalizationError, MessageError
 from sfa_localization.data.messages import NO_STAMP, read_stamp
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory
 
@@ -144,9 +144,17 @@ class Bag:
         return ((stamp_ns, value) for _, stamp_ns, value in self.read([stream]))
 
     def to_odometry(self, stream: Stream, values: StampedValues) -> Odometry:
-        """Odometry from a stream's values; an oddity is noted as a problem."""
-        odometry, oddity = motion.to_odometry(values)
-        self.problems += [f'{stream.topic}: {oddity}'] if oddity else []
+        """Odometry from a stream's values; oddities are noted as problems, and faulty messages are
+        counted as skipped. Raises BagError for two publishers.
+        """
+        try:
+            odometry, oddities, faults = motion.to_odometry(values, stream.topic)
+        except DataError as error:
+            raise BagError(f'{self.path}: {error}') from None
+        self.problems += [f'{stream.topic}: {oddity}' for oddity in oddities]
+        for reason, number in faults.items():
+            stream.skipped.add(reason, number)
+            stream.used -= number
         return odometry
 
     def stream(self, name: str, convert: Callable[[Any], Any], *, required: bool = True) -> Stream:

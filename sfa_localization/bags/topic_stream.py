@@ -13,16 +13,10 @@ import numpy as np
 
 from sfa_localization.camera.video import ImageReader
 from sfa_localization.data.errors import BagError, LocalizationError
-from sfa_localization.data.events import CLOCK_RANGE_S
+from sfa_localization.data.events import CLOCK_JUMP_NS, CLOCK_RANGE_S, LEAP_SECONDS, whole_leap
 from sfa_localization.data.messages import NO_STAMP
 from sfa_localization.data.rejections import RejectionCounter
 from sfa_localization.data.run import Count
-
-CLOCK_JUMP_NS = 10_000_000_000
-"""A difference this large (10 s) between the steps of stamp and reception is a jump of the sender's
-clock: queues and networks delay a message by less."""
-LEAP_SECONDS = {18: 'GPS time', 19: 'TAI', 37: 'TAI'}
-"""Seconds, since 2017, by which GPS time is ahead of UTC, TAI of GPS time, and TAI of UTC."""
 
 
 class Item(NamedTuple):
@@ -156,10 +150,11 @@ def clock_offset(name: str, stream: Stream, odometry: Stream) -> tuple[int, str]
     # If a bag holds no times of reception, stamps are ahead by the length of the drive.
     if abs(offset) <= max(range_ns, spread, other_spread) or queued:
         return 0, ''
-    seconds, scale = abs(offset) * 1e-9, LEAP_SECONDS.get(round(abs(offset) * 1e-9), '')
+    offset_ns = whole_leap(offset)
+    seconds = abs(offset_ns) * 1e-9
+    scale = LEAP_SECONDS.get(round(seconds), '')
     if scale:
-        seconds = float(round(seconds))
         scale = f' ({stream.topic if offset > 0 else odometry.topic} in {scale}?)'
     where = 'ahead of' if offset > 0 else 'behind'
     text = f'{name}: stamped {seconds:.1f} s {where} the odometry, by their reception{scale}'
-    return round(np.copysign(seconds, offset) * 1e9), f'{text}: taken into account'
+    return offset_ns, f'{text}: taken into account'

@@ -74,7 +74,8 @@ def bodies(textures: NDArray[np.int8], yaw: Array, sphere: Sphere) -> list[Body]
     lowest = change[-max(round(LOWER * rows), 1) :].mean(0) < STILL / 2
     moving = np.where(change[::-1] < STILL, rows, np.arange(rows)[:, None]).min(0)
     top = np.where(lowest, rows - np.maximum(moving, round(LOWER * rows)), rows) / rows
-    top[(change.mean(0) < STILL) | (top < 1 - WHOLE)] = 0.0
+    whole = np.maximum(change.mean(0), change[: rows // 2].mean(0)) < STILL
+    top[whole | (top < 1 - WHOLE)] = 0.0
     parts, degrees = [], 360.0 / columns
     for first, last in _runs(top < 1.0):
         hidden = np.arange(first, last) % columns

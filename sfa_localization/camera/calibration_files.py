@@ -70,7 +70,8 @@ def calibration_of(camera: CameraConfig) -> LensCalibration:
         raise CameraError(
             'images are no panoramas, and no camera is described: in the parameter file set '
             'calibration_file (see the command calibrate), or camera_model to equirectangular or '
-            'panorama, in the section /**/omnicam_node; inspect prints what to write'
+            'panorama, in the section /**/omnicam_node; or publish camera_info beside the images; '
+            'inspect prints what to write'
         )
     return LensCalibration(camera_model=camera.camera_model)
 
@@ -101,6 +102,19 @@ def read_calibration(path: Path) -> LensCalibration:
         ) from None
     except (CameraError, ConfigError) as error:
         raise CameraError(f'{path}: {error}') from None
+
+
+def calibration_of_info(info: Any) -> LensCalibration:
+    """The lens in a message with the fields of sensor_msgs/CameraInfo. Raises CameraError."""
+    named = {name: getattr(info, name) for name in ('width', 'height', 'distortion_model')}
+    try:
+        lens = _from_others({**named, 'k': list(info.k), 'd': list(info.d)})
+        if info.roi.width and info.roi.height:  # columns and rows that the image has
+            lens['cx'], lens['cy'] = lens['cx'] - info.roi.x_offset, lens['cy'] - info.roi.y_offset
+            lens['image_width'], lens['image_height'] = info.roi.width, info.roi.height
+        return LensCalibration(**{'radius_min': 0.0, 'radius_max': 0.0, **lens})
+    except (ConfigError, CameraError) as error:
+        raise CameraError(f'{error}; or describe the camera by a calibration_file') from None
 
 
 def _from_ocam(text: str) -> dict[str, Any]:

@@ -126,6 +126,12 @@ class Unwrapper:
         rows, columns = nearest_visible(visible)
         return None if visible.all() else rows * size[1] + columns
 
+    @property
+    def mount_rpy(self) -> tuple[float, ...]:
+        """The angles by which panoramas of the camera are resampled, degrees; () for none."""
+        mount_rpy = self._of_panoramas()[0].mount_rpy
+        return mount_rpy if any(mount_rpy) else ()
+
     def keeping_size(self, size: tuple[int, int]) -> Unwrapper:
         """The same for panoramas of `size` (rows, columns), which keep it."""
         panorama = replace(self.panorama, height=size[0], width=size[1])

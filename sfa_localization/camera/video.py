@@ -39,6 +39,7 @@ class _Codec(NamedTuple):
 _H264 = _Codec('h264|x264|avc', 'h264', slice(3, 8), range(1, 6), range(5, 6))
 _HEVC = _Codec('h265|x265|hevc', 'hevc', slice(1, 7), range(32), range(16, 24))
 _OTHERS = 'av1|vp8|vp9|mpeg4'  # a loss would not be noticed in them
+_PARAMETERS_SIZE = 10_000  # bytes before an image that publishers may send alone: some hundred
 _PARAMETERS = 7  # type of a unit of H.264 with the parameters of the images after it
 _HIGH_PROFILES = (44, 83, 86, 100, 110, 118, 122, 128, 138, 139, 244)
 """Profiles of H.264 whose parameters begin with those of colors (7.3.2.1.1)."""
@@ -71,6 +72,8 @@ class ImageReader:
         if codec is None:
             self._video = None
             return [(stamp_ns, decode_compressed(message.data, format))]
+        if len(message.data) == 0:
+            raise CameraError('empty image')
         if self._video is None or self._video.codec is not codec:
             self._video = _Video(codec)
         return self._video.add(stamp_ns, bytes(message.data))
@@ -108,7 +111,7 @@ class _Video:
         self._decoder: Any = av.CodecContext.create(codec.decoder, 'r')
         self._decoder.options = {'err_detect': 'explode'}  # else FFmpeg paints over damage
         self._frames = _FrameNumbers()
-        self._packets = self._last_ns = 0
+        self._data, self._packets, self._last_ns = b'', 0, 0
         self._waiting: dict[int, int] = {}
         """Stamps, ns, of the packets whose images have not come out, by number of packet."""
         self._started, self._why = False, TOO_EARLY
@@ -120,12 +123,13 @@ class _Video:
         lost: list[StampedImage] = []
         if self.codec is _H264 and self._frames.are_missing(zip(kinds, units, strict=True)):
             lost = self._restart()
+        self._data = self._data[-_PARAMETERS_SIZE:] + data
+        if units and not any(kind in self.codec.images for kind in kinds):
+            return [*lost, (stamp_ns, CameraError(NO_IMAGE))]
         self._packets += 1
         self._waiting[self._packets] = stamp_ns
         self._started |= any(kind in self.codec.keys for kind in kinds)
-        results = lost + self._decode(data)
-        if not any(kind in self.codec.images for kind in kinds) and self._packets in self._waiting:
-            results += self._reject([self._packets], NO_IMAGE)
+        results, self._data = lost + self._decode(self._data), b''
         return results if self._started else results + self._reject(self._waiting, self._why)
 
     def finish(self) -> list[StampedImage]:
@@ -150,13 +154,13 @@ class _Video:
         number, waiting = frame.pts, self._waiting
         lost = [n for n in waiting if n < number] if frame.key_frame else []
         results = self._reject(lost, self._why)
+        self._started, self._why = True, AFTER_LOSS
         if number in waiting:
             later = [n for n in waiting if waiting[n] > self._last_ns] or [number]
             first = min(later, key=waiting.__getitem__)
             waiting[first], self._last_ns = waiting[number], waiting[first]
             del waiting[number]
             results.append((self._last_ns, frame.to_ndarray(format='bgr24')))
-            self._started, self._why = True, AFTER_LOSS
         return results
 
     def _restart(self) -> list[StampedImage]:
@@ -198,8 +202,9 @@ def _frame_num_length(bits: str) -> int:
     """Bits of frame_num by the bits of a parameter set; 0 where they are not found."""
     rest = _skip(bits[32:], 1)
     if int(bits[8:16], 2) in _HIGH_PROFILES:
-        chroma, rest = rest, _skip(rest, 3)
-        if chroma.startswith('00100') or rest[1] == '1':  # planes of colors, or matrices
+        has_planes = rest.startswith('00100')
+        rest = _skip(_skip(rest, 1)[has_planes:], 2)
+        if rest[1] == '1':  # matrices of different lengths
             return 0
         rest = rest[2:]
     zeros = rest.index('1')

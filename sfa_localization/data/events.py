@@ -15,6 +15,19 @@ DELAY_LIMIT_NS = 500_000_000
 """Largest delay of the camera's stamps, of either sign, that is compensated."""
 CLOCK_RANGE_S = 2.5
 """Largest difference of two clocks that turns show."""
+CLOCK_JUMP_NS = 10_000_000_000
+"""A difference this large (10 s) between stamp and reception is one of clocks: queues and networks
+delay a message by less."""
+LEAP_SECONDS = {18: 'GPS time', 19: 'TAI', 37: 'TAI'}
+"""Seconds, since 2017, by which GPS time is ahead of UTC, TAI of GPS time, and TAI of UTC."""
+
+
+def whole_leap(offset_ns: float) -> int:
+    """The offset of two clocks, ns, that reception shows to a fraction of a second: without the
+    fraction where it is one of LEAP_SECONDS.
+    """
+    seconds = round(offset_ns * 1e-9)
+    return seconds * 1_000_000_000 if abs(seconds) in LEAP_SECONDS else round(offset_ns)
 
 
 def merge_by_stamp(odometry_ns: Stamps, images_ns: Stamps) -> Iterator[tuple[int, int, int]]:

@@ -54,6 +54,17 @@ def read_planar(position: Any, orientation: Any) -> tuple[float, float, float]:
     return x, y, read_yaw(orientation)
 
 
+def read_odometry(
+    message: Any,
+) -> tuple[tuple[float, float, float] | None, tuple[float, float, float, float]]:
+    """Pose of an Odometry, None where it is not filled with one, and its twist: see read_twist."""
+    twist = read_twist(message)
+    try:
+        return read_planar(message.pose.pose.position, message.pose.pose.orientation), twist
+    except MessageError:
+        return None, twist
+
+
 def read_twist(message: Any) -> tuple[float, float, float, float]:
     """v m/s and omega rad/s of an Odometry, and their variances, 0 if unknown."""
     twist, covariance = message.twist.twist, message.twist.covariance

@@ -4,17 +4,21 @@
 
 A step is a break where no speed before or after it explains it: it ends farther than `tolerance`
 from where each of them leads (`beyond`). Causes are wheel ticks that jump, a driver that restarts
-and a robot that was carried; the motion between the two poses is then unknown.
+and a robot that was carried; the motion between the two poses is then unknown. Where a later step
+leads back, the messages between are beside the path (`Paths`): a driver failed for a moment, or
+there is a second publisher.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Mask
 
 JUMP = 0.05
 """m or rad by which quantized and rounded poses may miss any speed."""
@@ -23,6 +27,15 @@ ACCELERATION, RAMP_S = 5.0, 0.2
 act within a step: longer ramps appear in the speeds before and after."""
 NOISE = 6.0
 """Standard deviations of the odometry's noise that a break exceeds as well."""
+NOISE_START, _NOISE_LEAST, _LEARNING = 0.01, 1e-3, 0.1
+"""m or rad: this noise before any message, and the least; relative change of it per message."""
+RETURN_S = 0.5
+"""Messages of a path pause for less: a driver that fails for longer breaks the path."""
+_STALE_S = 0.2
+"""Poses that are repeated, and messages that come in bundles, may be renewed as seldom as this."""
+IN_TURN, _MEMORY = 0.1, 50
+"""Share, among so many messages, of changes between two paths that move: 1 of two publishers that
+alternate, 0.2 where one is nine times as fast, 0 of single faults, whose pose stands."""
 
 
 def beyond(step: ArrayLike, seconds: ArrayLike, speeds: Sequence[ArrayLike]) -> Array:
@@ -51,3 +64,111 @@ def tolerance(seconds: ArrayLike, noise: float) -> Array:
     return np.asarray(
         JUMP + ACCELERATION * np.minimum(longest_s, RAMP_S) * longest_s + NOISE * noise
     )
+
+
+def learned(noise: float, distance: float) -> float:
+    """The standard deviation of steps after another one at this distance `beyond` the speed: their
+    running 68 % quantile.
+    """
+    return max(noise * math.exp(_LEARNING * (0.68 - (distance <= noise))), _NOISE_LEAST)
+
+
+class _Message(NamedTuple):
+    """A message that ends a path: its number among all, seconds, pose, v m/s and omega rad/s."""
+
+    path: int
+    number: int
+    seconds: float
+    pose: Sequence[float]
+    twist: tuple[float, float]
+
+
+class Paths:
+    """Which path each message of odometry continues; single messages beside a path are faults.
+
+    `noise` is the standard deviation of the steps, m or rad, which messages show by and by.
+    """
+
+    def __init__(self, noise: float = NOISE_START) -> None:
+        self._ends: list[_Message] = []  # of the paths; that of the last message comes last
+        self._messages, self._paths, self._returned = 0, 0, -1
+        self.noise, self._share = noise, 0.0
+        self.aside = 0
+        """Number of messages that the last one shows to be beside its path."""
+
+    @property
+    def in_turn(self) -> bool:
+        """Whether messages lead along two paths in turn, as those of two publishers."""
+        return self._share > IN_TURN
+
+    def add(self, seconds: float, pose: Sequence[float], v: float, omega: float) -> int:
+        """Take a message with a pose x m, y m, yaw rad; returns the number of its path."""
+        ends = [end for end in self._ends if seconds - end.seconds < RETURN_S]
+        message = _Message(self._paths, self._messages, seconds, pose, (v, omega))
+        best, least = None, math.inf
+        for end in reversed(ends):
+            distance = _distance(end, message)
+            excess = distance - float(tolerance(seconds - end.seconds, self.noise))
+            if excess < least and least > 0:
+                best, least, nearest = end, excess, distance
+        if best is not None:
+            self.noise = learned(self.noise, nearest)
+        self._paths += least > 0
+        self.aside = 0
+        if best is not None and least <= 0:
+            message = message._replace(path=best.path)
+            self._continued(best, message, best is ends[-1])
+        self._messages += 1
+        others = [end for end in ends if end.path != message.path]
+        self._ends = [*others[-2:], message]
+        return message.path
+
+    def _continued(self, end: _Message, message: _Message, is_last: bool) -> None:
+        """Take into account that a message continues a path, perhaps after others."""
+        if end.pose == message.pose:
+            return
+        changed = not is_last and self._returned != end.path
+        self._share += (changed - self._share) / _MEMORY
+        if not is_last:
+            self._returned = end.path
+            self.aside = 0 if self.in_turn else message.number - end.number - 1
+
+
+def _distance(end: _Message, message: _Message) -> float:
+    """How far a message, m or rad, is from where the speeds lead from the end of a path."""
+    seconds = message.seconds - end.seconds
+    dx, dy, turn = (b - a for a, b in zip(end.pose, message.pose, strict=True))
+    c, s, turn = math.cos(end.pose[2]), math.sin(end.pose[2]), math.remainder(turn, math.tau)
+    way, twists = (dx * c + dy * s, dy * c - dx * s), (end.twist, message.twist)
+    near = min(max(math.dist(way, (v * seconds, 0.0)), abs(turn - w * seconds)) for v, w in twists)
+    if near < JUMP:
+        return near
+    longest_s = seconds + _STALE_S
+    moved = beyond(way, longest_s, [(v, 0.0) for v, _ in twists])
+    return max(float(moved), float(beyond([turn], longest_s, [(w,) for _, w in twists])))
+
+
+def beside(seconds: Array, poses: Array, twists: Array) -> tuple[Mask, float]:
+    """Mask (N,) of messages that are beside a longer path, which others continue before and after
+    them; and the share of messages at which two paths are driven in turn.
+
+    `seconds` (N,) increase; `poses` (N, 3) are x m, y m, yaw rad, `twists` (N, 2) m/s and rad/s.
+    """
+    aside, noise, in_turn = np.zeros(len(poses), bool), NOISE_START, 0
+    for _ in range(2):  # the first time shows the noise
+        paths, number, in_turn = Paths(noise), [], 0
+        for row in zip(seconds.tolist(), poses.tolist(), *twists.T.tolist(), strict=True):
+            number.append(paths.add(*row))
+            in_turn += paths.in_turn
+        noise = paths.noise
+        if len({*number}) < 2:
+            return aside, 0.0
+    path = np.array(number, np.int64)
+    order = np.argsort(path, kind='stable')
+    of_path = np.split(order, np.flatnonzero(np.diff(path[order])) + 1)
+    lengths = [float(np.hypot(*np.diff(poses[rows, :2], axis=0).T).sum()) for rows in of_path]
+    for _, rows in sorted(zip(lengths, of_path, strict=True), key=lambda each: -each[0]):
+        if not aside[rows].any():
+            between = slice(rows[0], rows[-1])
+            aside[between] |= path[between] != path[rows[0]]
+    return aside, in_turn / len(poses)

@@ -258,6 +258,14 @@ def integrate(stamps_ns: Stamps, twists: Array, start: Array | None = None) -> A
     return poses
 
 
+def chained(start: Array, steps: Array) -> Array:
+    """Poses (N, 3) from a pose (3,) on by steps (N - 1, 3), each seen from the pose before."""
+    yaw = np.concatenate([start[2:], start[2] + np.cumsum(steps[:, 2])])
+    place = np.cumsum((steps[:, 0] + 1j * steps[:, 1]) * np.exp(1j * yaw[:-1]))
+    place = start[0] + 1j * start[1] + np.concatenate([[0.0], place])
+    return np.column_stack([place.real, place.imag, wrap_angle(yaw)])
+
+
 def differences(stamps_ns: Stamps, poses: Array) -> Array:
     """Twists (N, 2) that lead to each pose (N, 3) from the previous; the first is repeated."""
     if len(poses) < 2:

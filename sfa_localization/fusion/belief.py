@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.odometry_steps import NOISE_START
 from sfa_localization.data.rig import Quantity
 from sfa_localization.fusion.motion import Pace, State, Twist
 
@@ -65,7 +66,7 @@ class Odometer(NamedTuple):
     pose: Pose | None = None
     renewed_ns: int = 0
     fills_twist: bool = True
-    noise: float = 0.01
+    noise: float = NOISE_START
     suspect: OdometryEvent | None = None
     jump: Jump | None = None
 

@@ -14,7 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfa_localization.data.events import CLOCK_RANGE_S, ODOMETRY, merge_by_stamp
+from sfa_localization.data.events import (
+    CLOCK_JUMP_NS,
+    CLOCK_RANGE_S,
+    ODOMETRY,
+    merge_by_stamp,
+    whole_leap,
+)
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, Stamps
 
@@ -35,6 +41,8 @@ _SCALE_RAD, _OUTLIER, _ALIKE = 0.05, 4.0, 1.0
 _TURN_RAD, _TURNS_MIN = 0.05, 10
 # Neighboring pairs err alike: on a slow curve, things near the camera look like turns for seconds.
 _CAUTION, _SCALE_MIN_RAD, _STD_MAX_S = 4.0, 1e-3, 0.06
+_FAR_NS, _ARRIVALS = 2 * _WINDOW_NS, 10
+"""What arrives so far ahead, or behind, is of another clock, if so many images in a row are."""
 _MEAN_OF_NORMAL = 0.798  # of |x|: sqrt(2 / pi)
 
 
@@ -165,6 +173,53 @@ class CameraClockFinder:
         steepest = max(below - least, above - least)
         part = (below - above) / (2 * steepest) if steepest > 0 else 0.0
         return CameraClock(float(_GRID[best] + part * _STEP_S), float(std))
+
+
+class ImageClock:
+    """How far ahead of the odometry images are stamped, `offset_ns`, if farther than turns show.
+
+    The order of arrival shows it: images come soon after odometry of their time. It is used as soon
+    as the turns of images that are stamped so agree with those of the odometry.
+    """
+
+    def __init__(self, memory: float) -> None:
+        self.offset_ns, self._memory = 0, memory
+        self._ahead_ns: deque[int] = deque(maxlen=_ARRIVALS)
+        self._supposed: tuple[int, CameraClockFinder] | None = None
+
+    def add_odometry(self, stamp_ns: int, yaw_rad: float) -> None:
+        """Take the heading by dead reckoning."""
+        if self._supposed:
+            self._supposed[1].add_odometry(stamp_ns, yaw_rad)
+
+    def __str__(self) -> str:
+        seconds = self.offset_ns * 1e-9
+        where = 'ahead of' if seconds > 0 else 'behind'
+        return f'stamped {abs(seconds):.1f} s {where} the odometry; taken into account'
+
+    def add_heading(
+        self, stamp_ns: int, yaw_rad: float, odometry_ns: int
+    ) -> CameraClockFinder | None:
+        """Take the heading at an image's stamp, and the stamp of the last odometry; return what
+        follows the delay of the images from now on if another offset is confirmed.
+        """
+        self._ahead_ns.append(stamp_ns - odometry_ns)
+        ahead_ns = np.array(self._ahead_ns) - self.offset_ns
+        if len(ahead_ns) < _ARRIVALS or np.ptp(ahead_ns) > _IN_TRANSIT_NS:
+            return None
+        if -CLOCK_JUMP_NS < np.median(ahead_ns) < _FAR_NS:  # queues may delay images
+            self._supposed = None
+            return None
+        if self._supposed is None:
+            offset_ns = whole_leap(float(np.median(self._ahead_ns)))
+            offset_ns = offset_ns if abs(offset_ns) > _FAR_NS else 0
+            self._supposed = offset_ns, CameraClockFinder(self._memory)
+        offset_ns, finder = self._supposed
+        finder.add_heading(stamp_ns - offset_ns, yaw_rad)
+        if not finder.clock.is_estimated:
+            return None
+        self.offset_ns, self._supposed = offset_ns, None
+        return finder
 
 
 def camera_clock(odometry: Odometry, stamps_ns: Stamps, headings: Iterable[float]) -> CameraClock:

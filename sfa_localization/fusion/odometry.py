@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from sfa_localization.data.geometry import wrap_angle
-from sfa_localization.data.odometry_steps import beyond, tolerance
+from sfa_localization.data.odometry_steps import beyond, learned, tolerance
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import Belief, Jump, Odometer, OdometryEvent, Pose
 from sfa_localization.fusion.motion import Twist
@@ -19,7 +19,6 @@ from sfa_localization.fusion.motion import Twist
 ODOMETRY_TIMEOUT_S, COAST_S = 0.5, 2.0
 """Odometry silent for longer is a gap: many times the period of any odometry. The last speed is
 assumed to go on for 2 s: about how long robots keep a speed."""
-_LEARNING, _LEAST_NOISE = 0.1, 1e-3  # relative change per message of the steps' noise; m or rad
 _LONGEST_S = 2 * math.pi  # of a silence: at half a radian a second any heading is possible
 _JUMP = 0.05  # m or rad: motion beyond twice the speed by more took longer than stamps say
 _ROUNDED_M = 2e-3  # a pose moves less sideways by its rounding
@@ -58,9 +57,7 @@ def received(belief: Belief, event: OdometryEvent) -> Odometer:
     if changed or (renewed_ns and not _moves(belief, event)):
         renewed_ns = event.stamp_ns
     filled = bool(event.twist.v or event.twist.omega) or (last.fills_twist and not changed)
-    # The running 68 % quantile of what steps are beyond the speed: their standard deviation.
-    below = max(_beyond(belief, event)) <= last.noise
-    noise = max(last.noise * math.exp(_LEARNING * (0.68 - below)), _LEAST_NOISE)
+    noise = learned(last.noise, max(_beyond(belief, event)))
     return Odometer(event.stamp_ns, after, renewed_ns, filled, noise, None, last.jump)
 
 

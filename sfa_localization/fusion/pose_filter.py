@@ -21,6 +21,7 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.odometry_steps import Paths
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.belief import (
     Belief,
@@ -29,11 +30,12 @@ from sfa_localization.fusion.belief import (
     MeasurementEvent,
     Memory,
     OdometryEvent,
+    Pose,
     PoseEvent,
     Update,
     newest_new,
 )
-from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
+from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder, ImageClock
 from sfa_localization.fusion.ekf import Ekf
 from sfa_localization.fusion.health import Health, health_of
 from sfa_localization.fusion.history import History
@@ -73,6 +75,7 @@ class PoseFilter:
         self.scale = self.config.odometry_scale
         self._nis = 0.0, 0
         self._camera, self._expected_s = CameraClockFinder(_CLOCK_MEMORY), 0.0
+        self._images = ImageClock(_CLOCK_MEMORY)
         self._rig = Rig()
         self._ekf = Ekf(self.config, self.correlation, self._rig)
         self._history = self._fresh(self._ekf.blank(0))
@@ -101,6 +104,7 @@ class PoseFilter:
         self._camera = CameraClockFinder(_CLOCK_MEMORY, self._camera.clock)
         self._history = self._fresh(self._ekf.blank(0))
         self._timeline, self._open_loop = Timeline(), OpenLoop()
+        self._paths, self._was_empty = Paths(), False
         self._judged: tuple[object, Health] | None = None
         self._waiting: tuple[Array, Array] | None = None
         if self.config.initial_pose:
@@ -161,30 +165,49 @@ class PoseFilter:
             again = partial(self.add_odometry, stamp_ns, v, omega, variances, pose)
             self._timeline.require_order(stamp_ns, ODOMETRY, self._history, again)
             self._require_place(stamp_ns, ODOMETRY)
+            scaled = self._path_pose(stamp_ns, v, omega, pose)
         except DataError as error:
             self.counts[f'odometry: {error}'] += 1
             return str(error)
         self.counts['odometry: used'] += 1
         self._open_loop.add(twist.v, twist.omega)
-        scaled = None
-        if pose is not None and all(map(math.isfinite, pose)):
-            x, y, yaw = map(float, pose)
-            scaled = self.scale * x, self.scale * y, yaw
         driven = self._history.add((stamp_ns, ODOMETRY), OdometryEvent(stamp_ns, twist, scaled))
         if driven.odometry.stamp_ns == stamp_ns:
-            self._camera.add_odometry(stamp_ns, driven.dead_reckoned[2])
+            for clock in self._camera, self._images:
+                clock.add_odometry(stamp_ns, driven.dead_reckoned[2])
         return ''
+
+    def _path_pose(
+        self, stamp_ns: int, v: float, omega: float, pose: Sequence[float] | Array | None
+    ) -> Pose | None:
+        """The pose of a message in the scale of the map; None for one without, and while poses lead
+        along two paths in turn. Raises DataError for a single message without pose and twist.
+        """
+        posed = pose is not None and all(map(math.isfinite, pose))
+        empty = not (posed or v or omega) and self._history.newest.odometry.pose is not None
+        was_empty, self._was_empty = self._was_empty, empty
+        if empty and not was_empty:
+            raise DataError('neither pose nor twist')
+        if pose is None or not posed:
+            return None
+        x, y, yaw = map(float, pose)
+        self._paths.add(stamp_ns * 1e-9, (x, y, yaw), v, omega)
+        if self._paths.aside:
+            self.counts['odometry: pose beside the path'] += self._paths.aside
+            self.counts['odometry: used'] -= self._paths.aside
+        return None if self._paths.in_turn else (self.scale * x, self.scale * y, yaw)
 
     def add_measurement(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> Update:
         """Fuse a position (2,) or pose (3,) from an image of a stamp, with its covariance.
 
         A heading that is NaN or less certain than inputs.YAW_STD_LIMIT is left out. Zero covariance
         means unknown. The filter does not start from a pose so uncertain that it would be LOST.
+        The stamp of the update is by the clock of the odometry.
         """
-        stamp_ns = int(stamp_ns)
+        again = partial(self.add_measurement, stamp_ns, value, covariance)
+        stamp_ns = int(stamp_ns) - self._images.offset_ns
         try:
             fused, noise = read_measurement(value, covariance, self.config.measurement_factor)
-            again = partial(self.add_measurement, stamp_ns, value, covariance)
             self._timeline.require_order(stamp_ns, MEASUREMENT, self._history, again)
             clock = self._camera.clock_at(stamp_ns)
             taken_ns = stamp_ns - clock.delay_ns  # by the clock of the odometry
@@ -210,8 +233,15 @@ class PoseFilter:
         The turns of images and odometry together show by how much the camera's stamps are late;
         images are then fused where they were taken.
         """
-        if stamp_ns > 0 and math.isfinite(yaw_rad):
-            self._camera.add_heading(int(stamp_ns), yaw_rad)
+        if stamp_ns <= 0 or not math.isfinite(yaw_rad):
+            return
+        odometry_ns = self._history.newest.odometry.stamp_ns
+        if odometry_ns is not None:
+            finder = self._images.add_heading(int(stamp_ns), yaw_rad, odometry_ns)
+            if finder is not None:
+                self._camera, self._expected_s = finder, 0.0
+                self.counts[f'images: {self._images}'] += 1
+        self._camera.add_heading(int(stamp_ns) - self._images.offset_ns, yaw_rad)
 
     def expect(self, rig: Rig) -> None:
         """Take the rig of the training as prior. Estimates since the start stay; the camera delay
@@ -257,6 +287,11 @@ class PoseFilter:
     def camera_clock(self) -> CameraClock:
         """By how much images are stamped late, as far as turns have shown it."""
         return self._camera.clock
+
+    @property
+    def odometry_in_turn(self) -> bool:
+        """Whether poses of the odometry lead along two paths in turn, as of two publishers."""
+        return self._paths.in_turn
 
     @property
     def nis(self) -> float:
@@ -312,6 +347,8 @@ class PoseFilter:
         newest, clock = self._newest, self._camera.clock
         status = status_of(newest, newest.state, self.health, self.config)
         doubts = self._timeline.problems
+        if self.odometry_in_turn:
+            doubts.append('odometry leads along two paths in turn: its poses are not used')
         if abs(clock.delay_ns) > DELAY_LIMIT_NS:
             late = 'late' if clock.delay_s > 0 else 'early'
             size = f'{abs(clock.delay_s):.1f} s {late}'

@@ -15,9 +15,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, Mask, relative, wrap_angle
+from sfa_localization.data.geometry import Array, Mask, relative
 from sfa_localization.data.odometry_steps import JUMP, beyond, tolerance
-from sfa_localization.data.run import Odometry, Stamps
+from sfa_localization.data.run import Odometry, Stamps, chained
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
 from sfa_localization.keyframes.closures import LIKE
 from sfa_localization.metric.dead_reckoning import pauses, spaced, summed
@@ -98,10 +98,7 @@ def parted(odometry: Odometry) -> tuple[Odometry, str]:
         return odometry, elsewhere
     far = float(np.hypot(*(step - usual)[jump, :2].T).max())
     step = np.where(jump[:, None], usual, step)
-    x, y, yaw = odometry.poses[0]
-    yaw = yaw + summed(step[:, 2])
-    place = x + 1j * y + summed((step[:, 0] + 1j * step[:, 1]) * np.exp(1j * yaw[:-1]))
-    poses = np.column_stack([place.real, place.imag, wrap_angle(yaw)])
+    poses = chained(odometry.poses[0], step)
     count, joined = int(jump.sum()), int((jump & ~cut).sum())
     times = 'once' if count == 1 else f'{count} times'
     how = ['joined by its motion around'] * (joined > 0) + ['cut there'] * (joined < count)

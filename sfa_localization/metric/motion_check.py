@@ -25,6 +25,7 @@ from sfa_localization.data.run import Odometry, Run, StampedPanoramas, Stamps, Y
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
 from sfa_localization.metric.breaks import StampedTextures, contradicted, parted
 from sfa_localization.metric.motion_clocks import Drift, drift_sentences, drifts, following
+from sfa_localization.metric.motion_gyro import cleaned, is_worse
 from sfa_localization.metric.motion_sources import (
     ENOUGH,
     EQUAL,
@@ -162,8 +163,7 @@ def check_motion(
     repeats `commands` is followed by the robot.
     """
     check = MotionCheck([], odometry, gyro, [*_impossible(sources_of(odometry, images, gyro))])
-    impossible = bool(check.wrong)
-    if not impossible:
+    if not (impossible := bool(check.wrong)):
         images = _repaired(check, images)
     sources = sources_of(check.odometry, images, check.gyro)
     pairs = [compare(a, b, what) for what in ('turns', 'way') for a, b in combinations(sources, 2)]
@@ -176,7 +176,7 @@ def check_motion(
         _judge_axes(check)
         _judge_following(check, sources, commands)
         _judge(check, 'turns')
-        _judge_clocks(check)
+        _judge_clocks(check, images)
         if views is not None:
             clock = check.image_drift or Drift(0, turns.late_s if turns else 0.0, 0.0)
             taken_ns = views[0] - clock.late_ns(views[0])
@@ -262,7 +262,7 @@ def _repaired(
     check: MotionCheck, images: tuple[Stamps, Array] | None
 ) -> tuple[Stamps, Array] | None:
     """Correct odometry that jumps or heads aside; stamp the images, and `check.gyro`, by its clock
-    where theirs drifts.
+    where theirs drifts; leave out faulty samples of the gyroscope.
     """
     for change in parted, _straightened:
         check.odometry, text = change(check.odometry)
@@ -274,9 +274,11 @@ def _repaired(
         stamps_ns = stamps_ns - drifting[GYRO].late_ns(stamps_ns)
         check.gyro = replace(check.gyro, stamps_ns=stamps_ns)
     check.image_drift = drifting.get(IMAGES)
-    if images is None or check.image_drift is None:
-        return images
-    return images[0] - check.image_drift.late_ns(images[0]), images[1]
+    if images is not None and check.image_drift is not None:
+        images = images[0] - check.image_drift.late_ns(images[0]), images[1]
+    check.gyro, text = cleaned(check.odometry, images, check.gyro)
+    check.corrected += [text] if text else []
+    return images
 
 
 def _judge_following(check: MotionCheck, sources: Sequence[Source], commands: bool) -> None:
@@ -372,8 +374,10 @@ def _correct_gyro(check: MotionCheck, kind: str, text: str, factor: float) -> No
         check.gyro = None
 
 
-def _judge_clocks(check: MotionCheck) -> None:
-    """Correct the stamps of the gyroscope; the training corrects those of images."""
+def _judge_clocks(check: MotionCheck, images: tuple[Stamps, Array] | None) -> None:
+    """Correct the stamps of the gyroscope, and leave out one that is worse than none even then; the
+    training corrects the stamps of images.
+    """
     if check.gyro is not None and not check.odometry.trajectory.covers(check.gyro.stamps_ns).any():
         check.corrected.append(f'{GYRO}: stamped by another clock than the odometry; left out')
         check.gyro = None
@@ -387,3 +391,6 @@ def _judge_clocks(check: MotionCheck) -> None:
         if name == GYRO and check.gyro is not None:
             check.gyro = replace(check.gyro, stamps_ns=check.gyro.stamps_ns - late_ns)
         check.corrected.append(f'{name}: stamped {late(pair.late_s)}; taken into account')
+    if is_worse(check.odometry, images, check.gyro):
+        check.corrected.append(f'{GYRO}: left out: the wheels agree better with the images')
+        check.gyro = None

@@ -85,10 +85,14 @@ def read_info(message: String) -> PanoramaConfig:
         raise MessageError(str(error)) from None
 
 
-def read_odometry(message: Odometry) -> tuple[int, tuple[float, ...], tuple[float, float, float]]:
-    """Stamp, twist (v m/s, omega rad/s, and their variances, 0 if unknown) and odometry's pose."""
-    pose = messages.read_planar(message.pose.pose.position, message.pose.pose.orientation)
-    return read_stamp(message.header.stamp), messages.read_twist(message), pose
+def read_odometry(
+    message: Odometry,
+) -> tuple[int, tuple[float, ...], tuple[float, float, float] | None]:
+    """Stamp, twist (v m/s, omega rad/s, and their variances, 0 if unknown) and odometry's pose;
+    None where it is not filled.
+    """
+    pose, twist = messages.read_odometry(message)
+    return read_stamp(message.header.stamp), twist, pose
 
 
 def read_pose(message: geometry.PoseWithCovarianceStamped) -> tuple[int, Array, Array]:

@@ -51,10 +51,11 @@ IMAGES_SILENCE = 3.0
 """Images may be silent this many times longer than odometry, because they come less often."""
 _WATCH_PERIOD_S = 0.2
 _BACKLOG_S = 0.2  # odometry that waited for longer is fused, but not published each time
-_BEHIND_LOG_S = 60.0  # between warnings in the log that this node is behind
+_LOG_S = 60.0  # between equal warnings in the log
 _REPEAT_STATE_S = 0.9  # between states of the same level with other reasons
 _OFF_GRID_NS = 500  # added to transforms of the future: tf2 rejects a stamp that it has already
 _BACKWARD_JUMP_NS = -500_000_000  # of simulated time; less is jitter
+NO_POSE = 'its pose is not filled: only the twist is used, and map -> odom is not published'
 _ODOM, _IMAGE_POSE = 'odom', 'sfa/pose_with_covariance'
 
 
@@ -160,6 +161,8 @@ class EkfNode(LocalizationNode):
         reason = self.filter.add_odometry(stamp_ns, v, omega, noise, pose)
         if reason:
             raise MessageError(reason)
+        if pose is None:
+            self.get_logger().warning(f'{self.full_name(_ODOM)}: {NO_POSE}', once=True)
         now_s = steady_s()
         if self.monitors[_ODOM].waited_s > _BACKLOG_S > now_s - self._published_s:
             return
@@ -167,7 +170,8 @@ class EkfNode(LocalizationNode):
         state = self.filter.at(stamp_ns)
         if state is not None:
             self._publish_odometry(state)
-            self._publish_transform(state, pose)
+            if pose is not None:
+                self._publish_transform(state, pose)
             self._extend_path(state)
 
     def _receive_pose(self, message: geometry.PoseWithCovarianceStamped) -> None:
@@ -179,7 +183,7 @@ class EkfNode(LocalizationNode):
             covariance[2, 2] = math.inf  # a source without heading leaves its variance 0
         update = self.filter.add_measurement(stamp_ns, pose, covariance)
         self._publish_verdict(update)
-        self._publish_pose(stamp_ns)
+        self._publish_pose(update.stamp_ns)
         if not update.accepted:
             raise MessageError(update.reason)
 
@@ -318,12 +322,16 @@ class EkfNode(LocalizationNode):
                 reasons.append(f'nobody publishes on {name}')
             elif limit < silent < math.inf:
                 reasons.append(f'nothing on {name} for {silent:.0f} s')
+        name = self.full_name(_ODOM)
+        if self.filter.odometry_in_turn and self.count_publishers(name) > 1:
+            reasons.append(f'two publishers on {name}: stop one, or take another topic by odom:=')
+            self.get_logger().warning(reasons[-1], throttle_duration_sec=_LOG_S)
         if self._paused:
             reasons.append('paused: images are not fused')
         lost, behind_s = [], self._behind_s()
         if behind_s > timeout_s:
             reasons.append(f'behind by {behind_s:.1f} s: this computer is too busy')
-            self.get_logger().warning(reasons[-1], throttle_duration_sec=_BEHIND_LOG_S)
+            self.get_logger().warning(reasons[-1], throttle_duration_sec=_LOG_S)
         elif by_now is not None and (reasons or status.level is Level.DEGRADED):
             # The filter knows the stamps of messages only; by the wall clock it may be lost.
             lost = [f'{reason} by now' for reason in uncertainty(by_now, self.filter.config)]

@@ -13,14 +13,20 @@ from typing import Any, cast
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from sensor_msgs.msg import CompressedImage, Imu
+from sensor_msgs.msg import CameraInfo, CompressedImage, Imu
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import String
 
+from sfa_localization.camera.calibration_files import calibration_of_info
 from sfa_localization.camera.capture import Feed, FeedStatus, opener
 from sfa_localization.camera.leveling import leveled, tilts_at
 from sfa_localization.camera.panorama import Unwrapper
-from sfa_localization.camera.settings import CameraConfig, CaptureConfig, PanoramaConfig
+from sfa_localization.camera.settings import (
+    CameraConfig,
+    CaptureConfig,
+    LensCalibration,
+    PanoramaConfig,
+)
 from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import MessageError
 from sfa_localization.data.messages import read_stamp, read_tilt
@@ -37,6 +43,7 @@ from sfa_localization.nodes.settings import OmnicamNodeConfig
 _DEMAND_PERIOD_S = 0.1  # between checks for subscribers: a new one waits no longer for images
 _LITTLE_VISIBLE = 0.5  # a smaller visible share of the panorama gives a warning
 _IMU, _ORIENTATIONS = 'imu/data', 500  # the number kept: those of a second or more
+_CAMERA_INFO = 'camera_info'
 _JPEG_QUALITY = 90  # percent: no visible artifacts, a tenth of the raw size
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -51,7 +58,6 @@ class OmnicamNode(lifecycle.LocalizationNode):
         groups = [OmnicamNodeConfig, CaptureConfig, CameraConfig, PanoramaConfig]
         super().__init__('omnicam_node', groups, **options)
         self._config = self.settings(OmnicamNodeConfig)
-        self._unwrapper = self._new_unwrapper(self._settings)
         self._size: tuple[int, int] | None = None
         self._begin()
 
@@ -60,6 +66,9 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._losses = 0
         self._listening_since_s: float | None = None
         self._images: ImageInput | None = None
+        self._calibrations: Any = None
+        self._lens: LensCalibration | None = None
+        self._unwrapper = self._new_unwrapper(self._settings)
         self._newest: deque[tuple[int, Image]] = deque(maxlen=1)
         self._tilts: deque[tuple[int, float, float]] = deque(maxlen=_ORIENTATIONS)
         self._is_level = True
@@ -119,6 +128,31 @@ class OmnicamNode(lifecycle.LocalizationNode):
         elif self._listening_since_s is None and self._images is not None:
             self._listening_since_s = steady_s()
             self._images.start(self._substitute)
+            camera = self.settings(CameraConfig)
+            if not (camera.calibration_file or camera.camera_model):
+                take, qos, topic = self._take_calibration, lifecycle.sensor_qos(1), self._info_topic
+                self._calibrations = self.subscribe(CameraInfo, _CAMERA_INFO, take, qos, topic)
+
+    @property
+    def _info_topic(self) -> str:
+        """The topic beside that of the images, as image_transport names it, unless remapped."""
+        resolved = self.resolve_topic_name(_CAMERA_INFO)
+        if resolved != self.resolve_topic_name(_CAMERA_INFO, only_expand=True):
+            return resolved
+        images = self.full_name(self._input).removesuffix(f'/{self._config.image_transport}')
+        return f'{images.rpartition("/")[0]}/{_CAMERA_INFO}'
+
+    def _take_calibration(self, message: CameraInfo) -> None:
+        """Use the first that describes a lens."""
+        lens = calibration_of_info(message)
+        if self._lens is None:
+            unwrapper = self._new_unwrapper(self._settings, lens)
+            unwrapper.check(self._size)
+            self._lens, self._unwrapper = lens, unwrapper
+            camera = f'{lens.camera_model} camera of {lens.image_width} x {lens.image_height}'
+            self.get_logger().info(f'{self.full_name(_CAMERA_INFO)} describes a {camera} pixels')
+        elif lens != self._lens:
+            raise MessageError('another calibration than the first, which stays until a restart')
 
     def _report_loss(self, status: FeedStatus) -> None:
         """Log and count each time that the source could not be opened, or was lost."""
@@ -135,7 +169,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def _stop_listening(self) -> None:
         if self._images is not None:
             self._images.stop()
-        self._listening_since_s = None
+        self.unsubscribe(self._calibrations)
+        self._listening_since_s = self._calibrations = None
 
     def _deliver(self, image: Image) -> None:
         """Keep the newest image, and wake the executor; called by the feed's thread."""
@@ -188,20 +223,20 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def check(self, settings: Current) -> None:
         """Raises LocalizationError for a mask, sector, mount or elevation that hides all."""
         if any(settings[kind] != self._settings[kind] for kind in (CameraConfig, PanoramaConfig)):
-            self._new_unwrapper(settings).check(self._size)
+            self._new_unwrapper(settings, self._lens).check(self._size)
 
     def settings_changed(self, settings: Settings) -> None:
         if isinstance(settings, CaptureConfig) and self._feed is not None:
             self._feed.config = settings
         elif isinstance(settings, (CameraConfig, PanoramaConfig)):
-            self._unwrapper = self._new_unwrapper(self._settings)
+            self._unwrapper = self._new_unwrapper(self._settings, self._lens)
             if self.active:
                 self._info.publish(convert.to_info(self.settings(PanoramaConfig)))
 
     @staticmethod
-    def _new_unwrapper(settings: Current) -> Unwrapper:
+    def _new_unwrapper(settings: Current, lens: LensCalibration | None = None) -> Unwrapper:
         camera, panorama = settings[CameraConfig], settings[PanoramaConfig]
-        return Unwrapper(cast(CameraConfig, camera), cast(PanoramaConfig, panorama))
+        return Unwrapper(cast(CameraConfig, camera), cast(PanoramaConfig, panorama), lens)
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         details = {'camera model': self._unwrapper.model}

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,7 +17,8 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
+from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig, WatchConfig
 from sfa_localization.camera.watch import EXPLAINED_WARNING
 from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.run import Image
@@ -135,10 +137,20 @@ class SfaNode(LocalizationNode):
         assert self._observer is not None
         if problem := self._declared_problem(self._observer.model.panorama):
             raise MessageError(problem)
+        image = self._mounted(image, self._observer.model)
         self._last = observation = self._observer.observe(stamp_ns, image)
         self._publish(observation)
         if observation.problem:
             raise MessageError(observation.problem)
+
+    def _mounted(self, image: Image, model: PlaceModel) -> Image:
+        """An image of a camera, resampled as in training; omnicam_node, which declares its
+        panoramas, has done so.
+        """
+        expected = image.shape[:2] == (model.panorama.height, model.panorama.width)
+        if self._declared is not None or not (model.mount_rpy and expected):
+            return image
+        return _unwrapper(model.mount_rpy, model.panorama)(image)
 
     def _publish(self, seen: Observation) -> None:
         """Publish an observation; a pose of an unusable image only with its large covariance."""
@@ -176,6 +188,11 @@ class SfaNode(LocalizationNode):
         if explained < EXPLAINED_WARNING:
             return _WARN, 'images are unlike those of training', values
         return _OK, 'locating', values
+
+
+@lru_cache(maxsize=1)
+def _unwrapper(mount_rpy: tuple[float, ...], panorama: PanoramaConfig) -> Unwrapper:
+    return Unwrapper(CameraConfig(mount_rpy=mount_rpy), panorama)
 
 
 def _feature_pose(slow: Any, stamp_ns: int) -> PoseStamped:

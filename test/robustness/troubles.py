@@ -25,8 +25,10 @@ from rosbags.typesys import Stores
 
 from sfa_localization.bags.decoding import FIX, IMAGE, typestore
 from sfa_localization.bags.writer import blank
-from sfa_localization.camera.encodings import decode_compressed
+from sfa_localization.camera.encodings import decode_compressed, encode_jpeg
+from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.messages import read_yaw
+from sfa_localization.data.sphere import rotation
 
 TRAINING, TEST = Path('bags/sample'), Path('bags/sample_test')
 IMAGES, ODOMETRY, IMU, TRUTH = '/panorama/compressed', '/odom', '/imu', '/ground_truth'
@@ -52,6 +54,8 @@ class Trouble:
     """Of `train`."""
     kinds: Mapping[str, str] = field(default_factory=dict)
     """Types of topics that get others."""
+    camera: str = ''
+    """Parameters of omnicam_node, as YAML, for `train` and `evaluate`."""
 
 
 def stamp_of(message):
@@ -95,19 +99,24 @@ def tried(name, folder, model):
     """What train and evaluate say of a trouble, and the errors of one image and of the filter, m;
     None after a refusal. `model` is that of the untouched drive.
     """
-    trouble, text = TROUBLES[name], ''
+    trouble, text, parameters = TROUBLES[name], '', []
+    if trouble.camera:
+        parameters = ['--config', folder / 'parameters.yaml']
+        parameters[1].write_text(
+            f'/**/omnicam_node: {{ros__parameters: {{{trouble.camera}}}}}', encoding='utf-8'
+        )
     for source in (TRAINING, TEST) if trouble.trains else (TEST,):
         alter(source, folder / source.name, trouble.changes(), kinds=trouble.kinds)
     training = folder / TRAINING.name if trouble.trains else TRAINING
     if trouble.trains:
         model = folder / 'model.npz'
-        code, text = run('train', training, '--output', model, *trouble.options)
+        code, text = run('train', training, '--output', model, *trouble.options, *parameters)
         if code:
             return text, None
     results = folder / 'results.json'
     test = folder / TEST.name
     options = '--ground-truth-topic', TRUTH, '--align', training, '--json', results
-    code, said = run('evaluate', model, test, *options)
+    code, said = run('evaluate', model, test, *options, *parameters)
     if code:
         return text + said, None
     errors = json.loads(results.read_text())
@@ -130,6 +139,55 @@ def lost(m, rng, share=0.05):
     if rng.random() < share:
         m.pose.position.x = m.pose.position.y = 0.0
         m.pose.orientation = type(m.pose.orientation)(0.0, 0.0, 0.0, 1.0)
+
+
+def wrong_rate(share, value):
+    """A gyroscope of which a share of the messages reports another rate, rad/s."""
+
+    def change(m, rng):
+        if rng.random() < share:
+            m.angular_velocity.z = value * rng.choice([-1.0, 1.0])
+
+    return change
+
+
+def held_rate(period_s=4.0, share=0.25):
+    """A gyroscope that repeats a rate for a share of each period."""
+    last = [0.0]
+
+    def change(m, _):
+        if stamp_of(m) * 1e-9 % period_s < share * period_s:
+            m.angular_velocity.z = last[0]
+        last[0] = m.angular_velocity.z
+
+    return change
+
+
+def second_publisher():
+    """Every second message comes from another publisher, whose origin is elsewhere."""
+    count = itertools.count()
+
+    def change(m, _):
+        if next(count) % 2:
+            place, q = m.pose.pose.position, m.pose.pose.orientation
+            place.x, place.y = 2.0 - place.y, 1.0 + place.x  # turned by 90 degrees
+            q.z, q.w = (q.z + q.w) / math.sqrt(2.0), (q.w - q.z) / math.sqrt(2.0)
+
+    return change
+
+
+def fill(m, x, quaternion, twist=True):
+    """Fill the pose of a message with this x and quaternion, and perhaps its twist with zeros."""
+    m.pose.pose.position.x, m.pose.pose.position.y = x, 0.0
+    m.pose.pose.orientation = type(m.pose.pose.orientation)(*quaternion)
+    if not twist:
+        m.twist.twist.linear.x = m.twist.twist.angular.z = 0.0
+
+
+def zeros_at_times(m, rng):
+    """A driver that sends a message of zeros now and then."""
+    if rng.random() < 0.02:
+        fill(m, 0.0, (0, 0, 0, 1), twist=False)
 
 
 def ahead(topic, seconds):
@@ -268,6 +326,48 @@ def wandering():
     return true(lambda place, yaw: (next(path), yaw))[TRUTH]
 
 
+def seen(change):
+    """A change of panoramas (H, W, 3)."""
+
+    def changed(m, rng):
+        image = change(decode_compressed(m.data.tobytes()), rng)
+        m.data = np.frombuffer(encode_jpeg(image, 90), np.uint8)
+
+    return {IMAGES: changed}
+
+
+def body(share, top=0.0, plain=False):
+    """The robot itself, textured or plain gray, behind: on a share of the columns, and from a share
+    of the height downward.
+    """
+    colors = np.random.default_rng(7).integers(0, 255, (6, 15, 3), np.uint8)
+
+    def change(image, rng):
+        height, width = image.shape[:2]
+        size = round(share * width), height - round(top * height)
+        part = cv2.resize(colors, size, interpolation=cv2.INTER_NEAREST)
+        part = np.full_like(part, 90) if plain else part
+        image = np.roll(image, size[0] // 2, axis=1)
+        image[-size[1] :, : size[0]] = part
+        return np.roll(image, -(size[0] // 2), axis=1)
+
+    return seen(change)
+
+
+def mounted(roll, pitch, yaw):
+    """A camera that sits on the robot at these angles, degrees."""
+    turn = rotation(*np.radians([roll, pitch, yaw]))
+
+    def change(image, rng):
+        sphere, size = PanoramaConfig().sphere, image.shape[:2]
+        pixels = sphere.pixels(sphere.rays(*size) @ turn.T, *size).astype(np.float32)
+        around = np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
+        maps = pixels[..., 0] + 1, pixels[..., 1]
+        return cv2.remap(around, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    return seen(change)
+
+
 RIGHT_M = 0.055, 0.055
 """One image and filter of the untouched drive err by 0.042 m: a trouble that is mended adds a
 little."""
@@ -278,6 +378,33 @@ TROUBLES = {
     'truth: 0.3 s late': Trouble(
         lambda: {TRUTH: lambda m, _: restamp(m, stamp_of(m) + 300_000_000)},
         RIGHT_M, 'ground truth is stamped 0.3. s late', trains=False,
+    ),
+    'gyroscope: 20 % zeros': Trouble(
+        lambda: {IMU: wrong_rate(0.2, 0.0)}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
+    ),
+    'gyroscope: 1 % spikes': Trouble(
+        lambda: {IMU: wrong_rate(0.01, 30.0)}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
+    ),
+    'gyroscope: held': Trouble(
+        lambda: {IMU: held_rate()}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
+    ),
+    'gyroscope: half of it zeros': Trouble(
+        lambda: {IMU: wrong_rate(0.5, 0.0)}, RIGHT_M, 'gyroscope: left out: the wheels agree better'
+    ),
+    'odometry: two publishers': Trouble(
+        lambda: {ODOMETRY: second_publisher()}, None, 'two publishers on /odom: .*; stop one'
+    ),
+    'odometry: single zeros': Trouble(
+        lambda: {ODOMETRY: zeros_at_times},
+        RIGHT_M, 'messages left out: pose beside the path',
+    ),
+    'odometry: quaternion of zeros': Trouble(
+        lambda: {ODOMETRY: lambda m, _: fill(m, 0.0, (0, 0, 0, 0))},
+        RIGHT_M, 'have no pose .*; the twist is integrated',
+    ),
+    'odometry: NaN poses': Trouble(
+        lambda: {ODOMETRY: lambda m, _: fill(m, math.nan, (0, 0, 0, 1))},
+        RIGHT_M, 'have no pose .*; the twist is integrated',
     ),
     'images: TAI': Trouble(
         lambda: ahead(IMAGES, 37), RIGHT_M, r'images: stamped 37\.0 s ahead .* in TAI'
@@ -311,6 +438,18 @@ TROUBLES = {
         lambda: {IMAGES: cut_off}, RIGHT_M, 'images: .* cut-off JPEG'
     ),
     'images: H.264': Trouble(lambda: {IMAGES: as_video()}, RIGHT_M, 'images: 140 used'),
+    'body behind, a quarter': Trouble(
+        lambda: body(0.25), (1.0, 1.0), r'shows the robot: set blind_sectors: \[1[23].*, 2[34]'
+    ),
+    'body behind, the lower half': Trouble(
+        lambda: body(0.2, top=0.5, plain=True), (1.0, 1.0), 'the lower [45].% of the view from 1'
+    ),
+    'mast behind, hidden': Trouble(
+        lambda: body(0.06), (0.08, 0.065), 'SFA, one', camera='blind_sectors: [165.0, 195.0]'
+    ),
+    'camera askew, mount_rpy set': Trouble(
+        lambda: mounted(5.0, 0.0, 30.0), (0.07, 0.055), 'SFA, one',
+        camera='mount_rpy: [5.0, 0.0, 30.0]',
     'truth: 0.15 s early': Trouble(
         lambda: {TRUTH: lambda m, _: restamp(m, stamp_of(m) - 150_000_000)},
         RIGHT_M, 'ground truth is stamped 0.1. s early', trains=False,
