@@ -120,8 +120,8 @@ def test_the_page_of_an_evaluation(judged, tmp_path):
     assert content.headings == ['How far off?', 'Where is it weak?', 'May I trust it?',
                                 'What was rejected?', 'Worst images']  # fmt: skip
     for words in (
-        'images: 6 used; 3 skipped: too <dark> & small', 'a <model>', 'LOST 1.0 s', 'aligned on a drive',
-        '2 times measurement: outside the gate',
+        'images: 6 used; 3 skipped: too <dark> & small', 'a <model>', 'LOST 1.0 s',
+        '2 times measurement: outside the gate', 'aligned on a drive',
     ):  # fmt: skip
         assert words in content.text, 'escaped, and read back'
 

@@ -450,6 +450,7 @@ TROUBLES = {
     'camera askew, mount_rpy set': Trouble(
         lambda: mounted(5.0, 0.0, 30.0), (0.07, 0.055), 'SFA, one',
         camera='mount_rpy: [5.0, 0.0, 30.0]',
+    ),
     'truth: 0.15 s early': Trouble(
         lambda: {TRUTH: lambda m, _: restamp(m, stamp_of(m) - 150_000_000)},
         RIGHT_M, 'ground truth is stamped 0.1. s early', trains=False,
