@@ -54,6 +54,7 @@ class PictureReader:
     panorama: PanoramaConfig = SIZE
     heading: bool = True
     origin: tuple[float, float] | None = None
+    quality: dict = dataclasses.field(default_factory=dict)
     error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
     rig: Rig = dataclasses.field(default_factory=Rig)
     ground: DrivenGround = dataclasses.field(default_factory=lambda: DROVE)

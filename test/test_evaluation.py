@@ -12,6 +12,7 @@ from picture_readers import PictureReader, Recording
 from scipy import signal
 
 from sfa_localization import evaluation
+from sfa_localization.bags.reader import Bag
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.cli import main
 from sfa_localization.config import write_config
@@ -20,6 +21,7 @@ from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion import pose_filter
 from sfa_localization.fusion.belief import DrivenPath
 from sfa_localization.fusion.health import health_of
+from sfa_localization.metric.motion_truth import TruePoses
 from sfa_localization.place_model import PlaceModel
 
 
@@ -33,11 +35,17 @@ def model(monkeypatch):
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
 
 
-def evaluated(bag, tmp_path, **sections):
+def read_truth(bag):
+    with Bag(bag) as opened:
+        return opened.trajectory()
+
+
+def evaluated(bag, tmp_path, align='', **sections):
     """Return what evaluate counts with a parameter file of these sections."""
     write_config(tmp_path / 'own.yaml', sections)
     figures = tmp_path / 'figures.json'
     arguments = ['--config', str(tmp_path / 'own.yaml'), '--json', str(figures)]
+    arguments += ['--align', align] if align else []
     assert main(['evaluate', 'reader.npz', str(bag), *arguments]) == 0
     return json.loads(figures.read_text())
 
@@ -98,6 +106,19 @@ def test_what_the_filter_rejected_and_how_long_it_was_sure_or_wrong_is_printed(
     assert 0.5 * localised < wrong <= localised
     line = f'state: LOCALISED for {wrong:.1f} s with an error of more than a meter'
     assert line in capsys.readouterr().out
+
+
+def test_what_was_corrected_of_the_truth_is_said_and_headings_it_lacks_are_not_judged(
+    bag, tmp_path, monkeypatch, capsys, caplog
+):
+    poses = TruePoses(read_truth(bag), False, ('ground truth has no headings',))
+    monkeypatch.setattr(evaluation, 'true_poses', lambda *_: poses)
+    figures = evaluated(bag, tmp_path, align='none')
+    said = capsys.readouterr().out
+    assert figures['corrections'] == ['drive: ground truth has no headings']
+    assert 'drive: ground truth has no headings' in said and 'heading error' not in said
+    assert figures['ekf']['yaw_deg'] is None and figures['ekf']['mean'] < 0.1
+    assert 'has no measured points, so that its coordinates are its own' in caplog.text
 
 
 def spread_out(seed, covariance, count=4000):

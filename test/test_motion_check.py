@@ -18,9 +18,11 @@ from sfa_localization.bags.drives import read_drive
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.data.errors import CameraError, DataError
-from sfa_localization.data.run import Image, Odometry, PanoramaArray, Run, integrate
+from sfa_localization.data.geometry import align, wrap_angle
+from sfa_localization.data.run import Image, Odometry, PanoramaArray, Run, Trajectory, integrate
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
 from sfa_localization.metric.breaks import parted
+from sfa_localization.metric.dead_reckoning import OdometryTrack
 from sfa_localization.metric.motion_check import check_drives, check_motion
 from sfa_localization.metric.motion_sources import (
     IMAGES,
@@ -28,6 +30,8 @@ from sfa_localization.metric.motion_sources import (
     TWIST,
     compare_map,
 )
+from sfa_localization.metric.motion_truth import TruePoses, true_poses
+from sfa_localization.metric.settings import SegmentConfig
 from sfa_localization.training import train
 
 
@@ -345,3 +349,89 @@ def test_messages_in_bundles_or_at_a_low_rate_do_not_jump(name):
     slower = (rows(odometry, slice(None, None, every)) for every in (1, 5, 25))
     for each in (*slower, replace(odometry, stamps_ns=bundled)):
         assert parted(each)[1] == ''
+
+
+# The ground truth is one more source.
+
+
+def marked(truth: Trajectory, late_s=0.0, lever=0j, swapped=False, unit=1.0, aside=0.0):
+    """A truth of a marker beside base_link, with other stamps, axes, unit and headings."""
+    places = truth.poses[:, :2] @ [1, 1j] + lever * np.exp(1j * truth.poses[:, 2])
+    yaw = truth.poses[:, 2] + aside
+    if swapped:
+        places, yaw = 1j * places.conj(), np.pi / 2 - yaw
+    poses = np.column_stack([unit * places.real, unit * places.imag, yaw])
+    return Trajectory(truth.stamps_ns + round(late_s * 1e9), poses)
+
+
+def with_poses(truth: Trajectory, rows, pose) -> Trajectory:
+    poses = truth.poses.copy()
+    poses[rows] = pose
+    return replace(truth, poses=poses)
+
+
+TRUTHS = {
+    'late': (lambda t: marked(t, 0.3), 'is stamped 0.30 s late'),
+    'early': (lambda t: marked(t, -0.15), 'is stamped 0.15 s early'),
+    'another clock': (lambda t: marked(t, 37.0), 'is stamped 37.00 s late'),
+    'marker': (lambda t: marked(t, lever=-0.4 + 0.2j), 'lies 0.40 m behind and 0.20 m to the left'),
+    'mirrored': (lambda t: marked(t, 0.2, 0.3j, True), 'is mirrored (y to the right, or x and y'),
+    'millimeters': (lambda t: marked(t, unit=1000.0), 'is in millimeters'),
+    'centimeters': (lambda t: marked(t, 0.1, unit=100.0), 'is in centimeters'),
+    'turned marker': (lambda t: marked(t, aside=1.57), 'has headings +90 degrees beside'),
+    'no headings': (lambda t: with_poses(t, np.s_[:], t.poses * [1, 1, 0]), 'has no headings'),
+    'clockwise': (lambda t: with_poses(t, np.s_[:], t.poses * [1, 1, -1]), 'clockwise headings'),
+    'zeros': (lambda t: with_poses(t, np.s_[::20], 0.0), '33 of 644 messages contradict'),
+    'a place': (
+        lambda t: with_poses(t, np.s_[9::20], [2.0, -1.0, 0.0]),
+        '32 of 644 messages con',
+    ),
+    'held': (lambda t: with_poses(t, np.s_[301:316], t.poses[300]), 'up to 16 in a row'),
+}
+
+
+def with_truth(seed=1, lines=10):
+    twists, start = criss_cross(lines, seed=seed)
+    run = drive(twists, start=start, yaw_noise=0.1, speed_noise=0.1, seed=seed)
+    return OdometryTrack.of(run.odometry, SegmentConfig()), Trajectory(run.stamps_ns, run.poses)
+
+
+@pytest.mark.parametrize('name', TRUTHS)
+def test_a_faulty_truth_is_corrected(name):
+    change, text = TRUTHS[name]
+    track, truth = with_truth()
+    mended = true_poses(change(truth), track)
+    assert text in '; '.join(mended.sentences)
+    assert len(mended.sentences) == (3 if name == 'mirrored' else 2 if name == 'centimeters' else 1)
+    inside = truth.covers(mended.poses.stamps_ns)
+    right, poses = truth.at(mended.poses.stamps_ns[inside]), mended.poses.poses[inside]
+    frame = align(poses[:, :2], right[:, :2])
+    assert np.hypot(*(frame.apply(poses[:, :2]) - right[:, :2]).T).max() < 0.03
+    assert mended.headings == (name != 'no headings')
+    assert np.abs(wrap_angle(frame.apply_yaw(poses[:, 2]) - right[:, 2])).max() < np.deg2rad(10.0)
+
+
+@pytest.mark.parametrize('name', DRIVES)
+def test_a_right_truth_stays_as_it_is(name):
+    run = drive(DRIVES[name][0], start=DRIVES[name][1], yaw_noise=0.2, speed_noise=0.2, seed=1)
+    track = OdometryTrack.of(run.odometry, SegmentConfig())
+    noise = np.random.default_rng(0).normal(0.0, 0.01, run.poses.shape)
+    for poses in (run.poses, run.poses + noise):
+        truth = Trajectory(run.stamps_ns, poses)
+        assert true_poses(truth, track) == TruePoses(truth)
+
+
+def test_the_truth_of_another_drive_is_refused():
+    """But not by odometry that nothing confirms."""
+    track, truth = with_truth()
+    _, other = with_truth(seed=5)
+    with pytest.raises(DataError, match='moves independently of odometry: is it of this drive'):
+        true_poses(other, track)
+    assert true_poses(other, track, trusted=False).poses is other
+    with pytest.raises(DataError, match=r'drives 3\.2\d times as far as odometry: publish meters'):
+        true_poses(marked(truth, unit=3.28), track)
+
+
+def test_odometry_of_commands_shows_no_delay_of_a_truth():
+    track, truth = with_truth()
+    assert not true_poses(marked(truth, 0.2), track, open_loop=True).sentences

@@ -114,14 +114,14 @@ def test_the_page_of_an_evaluation(judged, tmp_path):
     features = rng.standard_normal((100, 8))
     evaluation.write_report(tmp_path, truth, estimates, scores, truth.poses[:, :2], features)
     evaluation.write_evaluation_page(
-        tmp_path, 'a <model>', truth, estimates, scores, counts, pictures
+        tmp_path, 'a <model>', truth, estimates, scores, counts, pictures, ['aligned on a drive']
     )
     content = read(tmp_path)
     assert content.headings == ['How far off?', 'Where is it weak?', 'May I trust it?',
                                 'What was rejected?', 'Worst images']  # fmt: skip
     for words in (
         'images: 6 used; 3 skipped: too <dark> & small', 'a <model>', 'LOST 1.0 s',
-        '2 times measurement: outside the gate',
+        '2 times measurement: outside the gate', 'aligned on a drive',
     ):  # fmt: skip
         assert words in content.text, 'escaped, and read back'
 
@@ -135,6 +135,14 @@ def test_the_answer_about_a_drive_follows_its_figures(judged):
         changed = {**scores, 'ekf': {**scores['ekf'], **change}}
         counted = {**counts, 'false_localised_s': wrong_s}
         assert evaluation.judgment(changed, counted)[0] == level
+    for ratio, words in (
+        (1.2, 'are right'),
+        (0.36, 'cautious: the errors are 0.60'),
+        (4.0, 'small'),
+    ):
+        sure = {**scores, 'ekf': {**scores['ekf'], 'nees': ratio, 'nees_right': [0.7, 1.4]}}
+        grade, text = evaluation.judgment(sure, counts)
+        assert words in text and (grade == page.GOOD) == (ratio < 2)
 
 
 def test_the_page_of_an_inspection(tmp_path):

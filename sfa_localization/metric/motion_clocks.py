@@ -81,7 +81,7 @@ def drift(a: Source, b: Source) -> Drift | None:
     slow, fast, windows_ns = chosen
     sign = 1 if slow is a else -1
     every = _Turns(fast, windows_ns, slow.moved(windows_ns, 'turns'), windows_ns[0, 0])
-    if every.turned[-1] < ENOUGH['turns']:
+    if not every.turned[-1] >= ENOUGH['turns']:  # also turns that are unknown
         return None
     part = (_PARTS * every.turned / every.turned[-1]).astype(int).clip(0, _PARTS - 1)
     centers_ns = [every.windows_ns[part >= k][0, 0] for k in range(_PARTS)]

@@ -294,6 +294,38 @@ def as_video(key_every=30):
     return encode
 
 
+def true(change):
+    """A ground truth whose place x + i y, m, and heading, rad, are changed."""
+
+    def altered(m, _):
+        p, q = m.pose.position, m.pose.orientation
+        yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y**2 + q.z**2))
+        place, yaw = change(complex(p.x, p.y), yaw)
+        p.x, p.y, q.z, q.w = place.real, place.imag, math.sin(yaw / 2), math.cos(yaw / 2)
+        if not np.isfinite(yaw):
+            q.z = q.w = 0.0
+
+    return {TRUTH: altered}
+
+
+def occluded():
+    """A tracker that repeats its last pose for a second in each six."""
+    seen = []
+
+    def altered(m, _):
+        seen.append(seen[-1] if len(seen) % 150 > 124 else m.pose)
+        m.pose = seen[-1]
+
+    return {TRUTH: altered}
+
+
+def wandering():
+    """The ground truth of another robot."""
+    seconds = itertools.count()
+    path = (complex(3 * math.cos(at / 90), 2 * math.sin(at / 40)) for at in seconds)
+    return true(lambda place, yaw: (next(path), yaw))[TRUTH]
+
+
 def seen(change):
     """A change of panoramas (H, W, 3)."""
 
@@ -341,11 +373,11 @@ RIGHT_M = 0.055, 0.055
 little."""
 TROUBLES = {
     'truth: 5 % zeros': Trouble(
-        lambda: {TRUTH: lost}, RIGHT_M, 'ground truth: .* of .* poses', trains=False
+        lambda: {TRUTH: lost}, RIGHT_M, 'ground truth: .* of .* messages contradict', trains=False
     ),
     'truth: 0.3 s late': Trouble(
         lambda: {TRUTH: lambda m, _: restamp(m, stamp_of(m) + 300_000_000)},
-        RIGHT_M, 'ground truth.* 0.30 s late', trains=False,
+        RIGHT_M, 'ground truth is stamped 0.3. s late', trains=False,
     ),
     'gyroscope: 20 % zeros': Trouble(
         lambda: {IMU: wrong_rate(0.2, 0.0)}, RIGHT_M, 'gyroscope: .* contradict wheels and images'
@@ -419,6 +451,32 @@ TROUBLES = {
     'camera askew, mount_rpy set': Trouble(
         lambda: mounted(5.0, 0.0, 30.0), (0.07, 0.055), 'SFA, one',
         camera='mount_rpy: [5.0, 0.0, 30.0]',
+    ),
+    'truth: 0.15 s early': Trouble(
+        lambda: {TRUTH: lambda m, _: restamp(m, stamp_of(m) - 150_000_000)},
+        RIGHT_M, 'ground truth is stamped 0.1. s early', trains=False,
+    ),
+    'truth: marker 0.45 m beside base_link': Trouble(
+        lambda: true(lambda place, yaw: (place + (0.4 + 0.2j) * np.exp(1j * yaw), yaw)),
+        RIGHT_M, 'ground truth lies 0.4. m ahead of and 0.(19|2.) m to the left', trains=False,
+    ),
+    'truth: x and y swapped': Trouble(
+        lambda: true(lambda place, yaw: (1j * place.conjugate(), math.pi / 2 - yaw)),
+        RIGHT_M, 'ground truth is mirrored',
+    ),
+    'truth: millimeters': Trouble(
+        lambda: true(lambda place, yaw: (1000 * place, yaw)),
+        RIGHT_M, 'ground truth is in millimeters; converted', trains=False,
+    ),
+    'truth: no heading': Trouble(
+        lambda: true(lambda place, yaw: (place, math.nan)),
+        RIGHT_M, 'ground truth has no headings of base_link; they are not judged', trains=False,
+    ),
+    'truth: last pose held': Trouble(
+        occluded, RIGHT_M, 'ground truth: 1.. of 810 messages contradict', trains=False
+    ),
+    'truth: of another drive': Trouble(
+        lambda: {TRUTH: wandering()}, None, 'ground truth moves independently', trains=False
     ),
 }  # fmt: skip
 
