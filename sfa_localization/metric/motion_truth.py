@@ -5,29 +5,28 @@
 In window w, over which the odometry o, psi hardly drifts, a marker at the lever arm l on the robot
 that is stamped tau late is at
 
-    p(t) = u_w [s_w o(t - tau) + exp(i psi(t - tau)) l] + c_w
+    p(t) = u_w [o(t - tau) + exp(i psi(t - tau)) l] + c_w
 
-or at its conjugate where the axes of the truth are mirrored. Rotation u_w, scale s_w and place c_w
-of each window, l, tau, the scale of the drive and the wheels' loss in turns are found by
-Gauss-Newton, with weights of Student's distribution. Estimates that are judged take no part.
+or at its conjugate where the axes of the truth are mirrored. Rotation and scale u_w and place c_w
+of each window follow from l and tau, which are found by Gauss-Newton with weights of Student's
+distribution. Estimates that are judged take no part.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
+from scipy.sparse import csr_array
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.events import CLOCK_RANGE_S
 from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_angle
 from sfa_localization.data.run import Trajectory
 from sfa_localization.data.statistics import LENGTH_TO_STD, evenly, outlier_factor, surprise
-from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack, summed
+from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack
 from sfa_localization.metric.motion_samples import fault_sentence, faulty
 from sfa_localization.metric.motion_sources import ALIKE, EQUAL, LATE_S, late
 
@@ -37,9 +36,9 @@ WINDOW_M, WINDOWS_MIN, NOISE_M = 3.0, 4, 0.01
 UNSTEADY = 0.15
 """Mean of 1 - cos of the rotations from window to window: at most 0.09 for real robots with their
 own truth, 0.2 and more with that of another drive or with mirrored axes."""
-CERTAIN = 9.0
-"""Twice the least gain of log-likelihood by a lever arm or a delay: chance reaches it in 3 of 1,000
-drives; 6 was the most of drives of real robots, 12 for a truth 0.1 s late over 28 m."""
+CERTAIN = 12.0
+"""Twice the least gain of log-likelihood by a lever arm or a delay: right truths reach 11,
+and one that is 0.1 s late over 28 m 13."""
 LEVER_MIN_M, WAY_MIN_M = 1.6 * TURN_SLIDE, 0.04
 """Smaller lever arms, and ways during a delay, stay: wheels that slide in turns look like a lever
 arm of TURN_SLIDE."""
@@ -49,12 +48,12 @@ ASIDE = np.deg2rad(10.0)
 """A smaller offset of the headings may be that of either source."""
 WHEELS_STD = 0.05
 """Of the scale of a window, by the drives of the simulator."""
-_PRIOR = np.array([1.0, 1.0, 1.0, 0.1, TURN_SLIDE])
-_SHIFTS_S, _ROUNDS, _SAMPLES, _STEP_S = (0.0, -1.0, 1.0, -2.0, 2.0), 12, 4000, 0.05
-_LEVER, _DELAY = [0, 1], [2]  # of theta
-_CLOSE = 1e-4  # m and s
+_SAMPLES, _STEP_S = 4000, 0.2
+_PRIOR_STD = np.array([1.0, 1.0, 1.0, 0.1])
+"""Of theta: lever arm ahead and to the left, m, delay, s, and logarithm of the scale."""
+_LEVER, _DELAY = [0, 1], [2]
+_STEP, _CLOSE, _ROUNDS = 0.05, 1e-4, 12  # of theta
 _UNITS = {1.0: '', 100.0: 'centimeters', 1000.0: 'millimeters'}
-V = TypeVar('V', np.float64, np.complex128)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,96 +70,52 @@ class TruePoses:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Values of `theta` (5,): lever arm ahead and to the left, m, delay, s, logarithm of the scale,
-    loss, m per rad, of which `free` ones were fitted. Of the samples `rows` (M,) that the odometry
-    covers: `residual` (M,) m with its robust `std`, and heading `yaw` (M,) rad of base_link in the
-    frame of the truth by the odometry.
+    """Values of `theta` (4,). Of the samples `rows` (M,) that the odometry covers: `residual` (M,)
+    m with its robust `std`, and exp(i heading) (M,) of base_link in the frame of the truth by the
+    odometry, or 0 where it hardly drives; `turns` of the other windows.
     """
 
     mirrored: bool
-    free: Mask
     theta: Array
     std: float
     rows: Indices
     residual: Complex
-    yaw: Array
+    facing: Complex
     turns: Complex
-    """(W,) rotations of the windows in which the robot drove."""
-
-    @property
-    def lever(self) -> complex:
-        return complex(*self.theta[:2])
-
-    @property
-    def delay_s(self) -> float:
-        return float(self.theta[2])
-
-    def cost(self, std: float) -> float:
-        """Negative log-likelihood of a place, for residuals of a standard deviation in m."""
-        return float(surprise(np.abs(self.residual / std) ** 2, 2).mean())
 
     @property
     def unsteady(self) -> float:
         return 1.0 - float((self.turns[1:] * self.turns[:-1].conj()).real.mean())
 
+    def rank(self) -> tuple[bool, float]:
+        """Sorts fits: straight ways match at any delay, but with rotations of their own."""
+        return self.unsteady > UNSTEADY, self.std
 
-@dataclass(frozen=True, slots=True)
-class _Windows:
-    """The first sample of each window (W,), and the window of each sample (M,)."""
-
-    first: Indices
-    number: Indices
-
-    @classmethod
-    def of(cls, keys: NDArray[np.float64]) -> _Windows:
-        """Of neighbors with equal keys (M, K)."""
-        begins = np.append(True, np.diff(keys, axis=0).any(1))
-        return cls(np.flatnonzero(begins), np.cumsum(begins) - 1)
-
-    def sums(self, values: NDArray[V]) -> NDArray[V]:
-        """(W, ...) of values (M, ...)."""
-        return np.asarray(np.add.reduceat(values, self.first, axis=0))
-
-    def centered(self, values: Complex, weight: Array) -> Complex:
-        """Values (M, K) without the means of windows."""
-        means = self.sums(weight[:, None] * values) / self.sums(weight)[:, None]
-        return np.asarray(values - means[self.number])
-
-    def without(self, values: Complex, direction: Complex, weight: Array, known: float) -> Complex:
-        """Values (M, K) without their parts along a direction (M,), which differs in each window by
-        a real factor with the precision `known`.
-        """
-        shares = self.sums(weight[:, None] * (direction.conj()[:, None] * values).real)
-        shares /= (self.sums(weight * np.abs(direction) ** 2) + known)[:, None]
-        return np.asarray(values - direction[:, None] * shares[self.number])
+    def cost(self, std: float) -> float:
+        """Twice the negative log-likelihood; the samples of a window err alike."""
+        squares = np.abs(self.residual / std) ** 2
+        return 2 * len(self.turns) * float(surprise(squares, 2).mean())
 
 
-@dataclass(frozen=True, slots=True)
-class _Linear:
-    """Residuals (M,) m of samples, their derivatives `slopes` (M, 5) by -theta, and rotations (W,)
-    of the windows, with a mask of those in which the robot drove.
+def _runs(*keys: NDArray[Any]) -> Indices:
+    """The number (M,) of the run of neighbors with equal keys (M,) to which each belongs."""
+    changes = np.any([np.diff(key) != 0 for key in keys], axis=0)
+    return np.append(0, np.cumsum(changes))
+
+
+def _matched(
+    true: Complex, here: Complex, windows: csr_array, weight: Array, variance: float
+) -> tuple[Complex, Complex, Array]:
+    """Residuals (M,) m of true places (M,) after the best motion of each of W windows (W, M) of
+    those by the odometry, the products of both (W,), and the mean squares of the latter (W,), m^2.
+    Windows with a weight of 1 have the `variance`, m^2.
     """
-
-    residual: Complex
-    slopes: Complex
-    turns: Complex
-    drove: Mask
-
-    def step(
-        self,
-        theta: Array,
-        expected: Array,
-        free: Mask,
-        weight: Array,
-        variance: float,
-    ) -> Array:
-        """The step (5,) of Gauss and Newton; windows of weight 1 have the `variance`, m^2."""
-        score = (weight[:, None] * (self.residual[:, None] * self.slopes.conj()).real).sum(0)
-        normal = ((weight[:, None] * self.slopes).conj().T @ self.slopes).real
-        prior, both, step = variance / _PRIOR**2, np.ix_(free, free), np.zeros(5)
-        score -= prior * (theta - expected)
-        step[free] = np.linalg.solve((normal + np.diag(prior))[both], score[free])
-        return np.clip(step, -0.5, 0.5)
+    total = windows @ weight
+    true, here = (path - windows.T @ (windows @ (weight * path) / total) for path in (true, here))
+    match, power = windows @ (weight * here.conj() * true), windows @ (weight * np.abs(here) ** 2)
+    size, sure = np.abs(match) + 1e-12, variance / WHEELS_STD**2
+    motion = match / size * (size + sure) / (power + sure)
+    return true - (windows.T @ motion) * here, match, np.where(total > 1, power / total, 0.0)
 
 
 class _Comparison:
@@ -169,7 +124,6 @@ class _Comparison:
     def __init__(self, truth: Trajectory, track: OdometryTrack) -> None:
         self.track, self.track_s, self.way = track, track.seconds, track.length
         self.wheels = track.poses[:, 0] + 1j * track.poses[:, 1]
-        self.lost = summed(track.way_per_loss())
         self.seconds = (truth.stamps_ns - track.stamps_ns[0]) * 1e-9
         self.places = truth.poses[:, 0] + 1j * truth.poses[:, 1]
         self.yaw = truth.poses[:, 2]
@@ -186,175 +140,147 @@ class _Comparison:
 
     def lag_s(self, mirrored: bool) -> float:
         """The delay by which the velocities of both are most alike, of any size."""
-        velocities = []
+        speeds = []
         for at, places in (self.track_s, self.wheels), (self.seconds, self.places):
-            step = np.diff(np.interp(np.arange(at[0], at[-1], 4 * _STEP_S), at, places))
-            most = 3 * np.quantile(np.abs(step), 0.5)
-            velocities.append(np.where(np.abs(step) < most, step, 0))
-        by_wheels, true = velocities
-        true = true.conj() if mirrored else true
-        product = np.abs(signal.correlate(true, by_wheels))
-        behind = int(np.argmax(product)) - len(by_wheels) + 1
-        return float(self.seconds[0] - self.track_s[0]) + 4 * _STEP_S * behind
+            step = np.diff(np.interp(np.arange(at[0], at[-1], _STEP_S), at, places))
+            speeds.append(np.where(np.abs(step) < 3 * np.median(np.abs(step)), step, 0))
+        by_wheels, true = speeds[0], speeds[1].conj() if mirrored else speeds[1]
+        behind = int(np.argmax(np.abs(signal.correlate(true, by_wheels)))) - len(by_wheels) + 1
+        return float(self.seconds[0] - self.track_s[0]) + _STEP_S * behind
 
     def fitted(
         self, mirrored: bool, theta: Array, free: Mask, rows: Indices, about_s: float
     ) -> _Fit | None:
-        """Start at theta (5,), and change its `free` values, in windows for a delay of about so
-        much; None without enough motion.
+        """Change the `free` values of theta (4,), in windows for about this delay; None without
+        enough motion.
         """
         at = self.seconds[rows] - about_s
         inside = (at >= self.track_s[0]) & (at <= self.track_s[-1])
-        rows, at = rows[inside], at[inside]
-        if self.used[rows].sum() < 3 * WINDOWS_MIN:
+        rows, used = rows[inside], self.used[rows[inside]]
+        if used.sum() < 3 * WINDOWS_MIN:
             return None
-        way = np.interp(at, self.track_s, self.way)
-        after = np.searchsorted(self.track_s, at, 'right')
-        windows = _Windows.of(np.column_stack([way // self.window_m, self.track.part[after - 1]]))
-        used, each = self.used[rows], len(rows) / len(windows.first)
+        windows = self._windows(at[inside])
+        each = len(rows) / windows.shape[0]
+        places = self.places[rows].conj() if mirrored else self.places[rows]
+
+        def matched(theta: Array, weight: Array, std: float) -> tuple[Complex, Complex, Array]:
+            here = self.marker(theta, self.seconds[rows])
+            return _matched(places, here, windows, weight, each * std**2)
+
         weight, std = used + 1e-6, NOISE_M
-        expected = np.where(np.abs(theta) > CLOCK_RANGE_S, theta, 0.0)  # a clock of its own
         for _ in range(_ROUNDS):
-            linear = self._linear(mirrored, theta, rows, windows, weight, each * std**2)
-            size = np.abs(linear.residual)
-            std = max(LENGTH_TO_STD * float(np.median(size[used])), NOISE_M)
-            weight = (used + 1e-6) / outlier_factor((size / std) ** 2, 2)
-            step = linear.step(theta, expected, free, weight, each * std**2)
-            theta = theta + step
+            residual, match, spread = matched(theta, weight, std)
+            std = max(LENGTH_TO_STD * float(np.median(np.abs(residual[used]))), NOISE_M)
+            weight = (used + 1e-6) / outlier_factor((np.abs(residual) / std) ** 2, 2)
+            sides = (theta + by * np.diag(_STEP * free) for by in (0.5, -0.5))
+            ahead, back = ([matched(near, weight, std)[0] for near in side] for side in sides)
+            jacobian = np.subtract(ahead, back).T / _STEP
+            weighted = jacobian.conj().T * (weight / (each * std**2))
+            information = (weighted @ jacobian).real + np.diag(1 / _PRIOR_STD**2)
+            pulled = (theta - [0, 0, about_s, 0]) / _PRIOR_STD**2
+            step = np.linalg.solve(information, -(weighted @ residual).real - pulled)
+            theta = theta + np.clip(step, -0.5, 0.5) * free
             if np.abs(step).max() < _CLOSE:
                 break
-        if linear.drove.sum() < WINDOWS_MIN:
+        drove = (spread > (self.window_m / 10) ** 2) & (match != 0)
+        if drove.sum() < WINDOWS_MIN:
             return None
-        middle = windows.sums(weight * way) / windows.sums(weight)
-        turns = linear.turns[linear.drove]
-        turned = np.interp(way, middle[linear.drove], np.unwrap(np.angle(turns)))
-        yaw = np.interp(self.seconds[rows] - theta[2], self.track_s, self.track.yaw) + turned
-        return _Fit(mirrored, free, theta, std, rows, linear.residual, yaw, turns)
+        turns = np.where(drove, np.exp(1j * np.angle(match)), 0)
+        facing = self._facing(self.seconds[rows] - theta[2]) * (windows.T @ turns)
+        return _Fit(mirrored, theta, std, rows, residual, facing, turns[drove])
 
-    def _linear(
-        self,
-        mirrored: bool,
-        theta: Array,
-        rows: Indices,
-        windows: _Windows,
-        weight: Array,
-        variance: float,
-    ) -> _Linear:
-        """The model near theta (5,); `variance` (m^2) is that of a window with a weight of 1."""
-        at, places = self.seconds[rows] - theta[2], self.places[rows]
-        now, later, before = (self._marker(theta, at + by) for by in (0.0, _STEP_S, -_STEP_S))
-        velocity = (later[0] - before[0]) / (2 * _STEP_S)
-        columns = [places.conj() if mirrored else places, velocity, *now]
-        centered = windows.centered(np.stack(columns, -1), weight).T
-        true, velocity, here, facing, driven, lost = centered
-        match = windows.sums(weight * here.conj() * true)
-        turns = match / np.maximum(np.abs(match), 1e-12)
-        u = turns[windows.number]
-        slopes = facing, 1j * facing, -velocity, driven, -lost
-        both = np.stack([true - u * here, *(u * slope for slope in slopes)], -1)
-        both = windows.without(both, 1j * u * here, weight, 1e-9)
-        both = windows.without(both, u * driven, weight, variance / WHEELS_STD**2)
-        square, total = windows.sums(weight * np.abs(here) ** 2), windows.sums(weight)
-        drove = (total > 1.0) & (square > total * (self.window_m / 10) ** 2)
-        return _Linear(both[:, 0], both[:, 1:], turns, drove)
+    def _windows(self, at: Array) -> csr_array:
+        """The windows (W, M) of sorted times (M,) s."""
+        way = np.interp(at, self.track_s, self.way)
+        part = self.track.part[np.searchsorted(self.track_s, at, 'right') - 1]
+        number = _runs(way // self.window_m, part)
+        return csr_array((np.ones(len(at)), (number, np.arange(len(at)))))
 
-    def _marker(self, theta: Array, at: Array) -> tuple[Complex, Complex, Complex, Complex]:
-        """By the odometry, at times (M,) s: place of the marker, exp(i psi), the place of base_link
-        and what a loss of 1 m per radian takes from it.
+    def _facing(self, at: Array) -> Complex:
+        """exp(i psi) (M,) at times (M,) s."""
+        return np.asarray(np.exp(1j * np.interp(at, self.track_s, self.track.yaw)))
+
+    def marker(self, theta: Array, seconds: Array) -> Complex:
+        """Places (M,) m by the odometry of a marker that is stamped at these times, s."""
+        driven = np.exp(theta[3]) * np.interp(seconds - theta[2], self.track_s, self.wheels)
+        return np.asarray(driven + complex(*theta[:2]) * self._facing(seconds - theta[2]))
+
+    def best(self, free: Mask) -> _Fit | None:
+        """The better of no delay and that of the velocities to start with; for mirrored axes only
+        where the windows then agree far better.
         """
-        facing = np.exp(1j * np.interp(at, self.track_s, self.track.yaw))
-        lost = np.interp(at, self.track_s, self.lost)
-        driven = np.exp(theta[3]) * (np.interp(at, self.track_s, self.wheels) - theta[4] * lost)
-        return driven + complex(*theta[:2]) * facing, facing, driven, lost
-
-    def best(self, shifts_s: Sequence[float], free: Mask) -> _Fit | None:
-        """The best of some delays to start with, and of plain and mirrored axes."""
         rows, chosen = evenly(len(self.seconds), _SAMPLES), []
         for mirrored in (False, True):
-            starts = [np.array([0.0, 0.0, s, 0.0, 0.0]) for s in shifts_s]
-            fits = [self.fitted(mirrored, start, free, rows, start[2]) for start in starts]
-            chosen.append(
-                min((fit for fit in fits if fit), key=lambda fit: fit.cost(FAULT_M), default=None)
-            )
+            fits = [
+                self.fitted(mirrored, np.array([0.0, 0.0, about_s, 0.0]), free, rows, about_s)
+                for about_s in (0.0, self.lag_s(mirrored) * free[2])
+            ]
+            chosen.append(min(filter(None, fits), key=_Fit.rank, default=None))
         plain, mirror = chosen
-        if plain is None or mirror is None:
-            return plain
-        return mirror if max(UNSTEADY / 4, 4 * mirror.unsteady) < plain.unsteady else plain
+        if plain and mirror and max(UNSTEADY / 4, 4 * mirror.unsteady) < plain.unsteady:
+            return mirror
+        return plain
 
     def settled(self, fit: _Fit, free: Mask) -> _Fit:
         """The fit with a delay and a lever arm only where they are certain, and matter."""
         steps = np.diff(self.way)
         speed = float((steps**2 / np.diff(self.track_s)).sum() / max(steps.sum(), 1e-9))
-        least_s = max(LATE_S, WAY_MIN_M / speed)
+        limits = (_LEVER, LEVER_MIN_M), (_DELAY, max(LATE_S, WAY_MIN_M / speed))
         rows, about_s = np.arange(len(self.seconds)), float(fit.theta[2])
 
-        def refitted(free: Mask) -> _Fit:
-            theta = np.where(free, fit.theta, 0.0)
-            fitted = self.fitted(fit.mirrored, theta, free, rows, about_s)
-            return fitted or replace(fit, free=free, theta=theta)
+        def refitted(theta: Array, free: Mask) -> _Fit | None:
+            return self.fitted(fit.mirrored, theta, free, rows, about_s)
 
-        fit = refitted(free)
-        for _ in range(2):
+        fit = refitted(fit.theta, free) or fit
+        for _ in limits:
             fewer = []
-            for chosen, least in (_LEVER, LEVER_MIN_M), (_DELAY, least_s):
-                if not fit.free[chosen].all():
+            for values, least in limits:
+                chosen = (fit.theta != 0) & ~np.isin(np.arange(4), values)
+                if not fit.theta[values].any():
                     continue
-                without = refitted(fit.free & ~np.isin(np.arange(5), chosen))
-                gain = 2 * len(fit.turns) * (self.cost(without, fit.std) - self.cost(fit, fit.std))
-                if gain < CERTAIN or np.linalg.norm(fit.theta[chosen]) < least:
-                    fewer.append(without)
-            if not fewer:
-                break
-            fit = min(fewer, key=lambda fit: self.cost(fit, FAULT_M))
+                without = refitted(fit.theta * chosen, chosen)
+                small = np.linalg.norm(fit.theta[values]) < least
+                if small or (without and without.cost(fit.std) - fit.cost(fit.std) < CERTAIN):
+                    fewer.append(without or replace(fit, theta=fit.theta * chosen))
+            fit = min(fewer, key=lambda fit: fit.cost(FAULT_M), default=fit)
         return fit
 
     def faults(self, fit: _Fit | None) -> Mask:
         """Samples (N,) that repeat the last pose while the robot drives on, or which a jump takes
         away from where the odometry puts them.
         """
-        theta = np.zeros(5) if fit is None else fit.theta
-        marker, *_ = self._marker(theta, self.seconds - theta[2])
+        marker = self.marker(np.zeros(4) if fit is None else fit.theta, self.seconds)
         step, way = np.abs(np.diff(self.places)), np.abs(np.diff(marker))
         jump = np.append(False, faulty(step - way, FAULT_M) & (step > way))
-        held = np.append(False, step == 0)
-        runs = _Windows.of(np.column_stack([np.cumsum(jump), held]))
-        before_jump = np.append(jump, False)[np.append(runs.first[1:], len(held))]
-        lost = held[runs.first] & before_jump & (runs.sums(np.append(0.0, way)) > FAULT_M)
-        mask = lost[runs.number]
+        held, part = np.append(False, step == 0), np.cumsum(jump)
+        run = _runs(part, held)
+        driven, jumps = (
+            np.bincount(run, np.append(0, way)),
+            np.bincount(run, np.append(jump[1:], 0)),
+        )
+        mask = held & ((driven > FAULT_M) & (jumps > 0))[run]
         if fit is not None:
-            off, parts = np.zeros(len(held)), _Windows.of(np.cumsum(jump)[:, None])
+            off = np.zeros(len(held))
             off[fit.rows] = np.abs(fit.residual)
-            mask |= faulty((parts.sums(off) / np.bincount(parts.number))[parts.number], FAULT_M)
+            mask |= faulty((np.bincount(part, off) / np.bincount(part))[part], FAULT_M)
         _, value = np.unique(self.places, return_inverse=True)
         return np.asarray(mask | (np.bincount(value, mask) > np.bincount(value) / 2)[value])
-
-    def facing(self, fit: _Fit) -> tuple[float, complex]:
-        """The sign of the truth's headings, and the mean of exp(i deviation) from the odometry's,
-        which is small for headings that are not those of base_link.
-        """
-        rows = np.flatnonzero(self.used[fit.rows])
-        usual = -1.0 if fit.mirrored else 1.0
-        both = [
-            (sign, complex(np.exp(1j * (sign * self.yaw[fit.rows] - fit.yaw))[rows].mean()))
-            for sign in (usual, -usual)
-        ]
-        return both[1] if abs(both[0][1]) < ALIKE < abs(both[1][1]) else both[0]
-
-    def cost(self, fit: _Fit, std: float) -> float:
-        """Negative log-likelihood of a sample, with its heading if the truth has any."""
-        alike = abs(self.facing(fit)[1])
-        return fit.cost(std) + ((1 - alike) / ASIDE**2 if alike > ALIKE else 0.0)
 
     def headings(self, fit: _Fit) -> tuple[Array, str, bool]:
         """Headings (N,) rad of base_link, with a sentence on what was corrected of those of the
         truth, and whether it has any.
         """
-        sign, mean = self.facing(fit)
-        if not abs(mean) > ALIKE:
-            by_wheels = np.interp(self.seconds, self.seconds[fit.rows], fit.yaw)
+        moved = fit.facing != 0
+        rows, facing, usual = fit.rows[moved], fit.facing[moved], -1.0 if fit.mirrored else 1.0
+        means = {
+            sign: (np.exp(1j * sign * self.yaw[rows]) * facing.conj())[self.used[rows]].mean()
+            for sign in (usual, -usual)
+        }
+        sign = -usual if abs(means[usual]) < ALIKE < abs(means[-usual]) else usual
+        if not abs(means[sign]) > ALIKE:
+            by_wheels = np.interp(self.seconds, self.seconds[rows], np.unwrap(np.angle(facing)))
             return by_wheels, 'has no headings of base_link; they are not judged', False
-        turned = '' if (sign < 0) == fit.mirrored else 'clockwise '
-        aside = float(np.angle(mean))
+        turned, aside = '' if sign == usual else 'clockwise ', float(np.angle(means[sign]))
         if abs(aside) < ASIDE:
             text = f'has {turned}headings; turned around' if turned else ''
             return sign * self.yaw, text, True
@@ -370,7 +296,7 @@ def true_poses(
     Only odometry that is `trusted` refutes a truth. `open_loop` odometry repeats commands, which
     the robot follows later: it shows no delay. Raises DataError for the truth of another drive.
     """
-    comparison, free = _Comparison(truth, track), np.array([True, True, not open_loop, True, True])
+    comparison, free = _Comparison(truth, track), np.array([True, True, not open_loop, True])
     factor = comparison.scale()
     if factor < 1e-9 and trusted:
         raise DataError(f'{TRUTH} does not move with the robot: is its topic the right one?')
@@ -378,10 +304,7 @@ def true_poses(
     unit = min(_UNITS, key=lambda unit: abs(np.log(factor / unit)))
     comparison.places /= unit
     comparison.used = ~comparison.faults(None)
-    fit = comparison.best(_SHIFTS_S, free)
-    if fit is None or fit.unsteady > UNSTEADY:
-        lags_s = [comparison.lag_s(mirrored) for mirrored in (False, True)]
-        fit = comparison.best([*lags_s, 0.0], free)
+    fit = comparison.best(free)
     if fit is None or (fit.unsteady > UNSTEADY and not trusted):
         return TruePoses(truth)
     if fit.unsteady > UNSTEADY:
@@ -401,15 +324,14 @@ def true_poses(
 def _corrected(truth: Trajectory, comparison: _Comparison, fit: _Fit, unit: float) -> TruePoses:
     """The truth after all corrections; itself if there are none."""
     yaw, text, headings = comparison.headings(fit)
-    lever, (x, y, late_s, *_) = fit.lever, fit.theta
+    x, y, late_s, _ = fit.theta.tolist()
     sides = f'{abs(x):.2f} m {"ahead of" if x > 0 else "behind"} and {abs(y):.2f} m to the '
+    side = f'{sides}{"left" if y > 0 else "right"} of base_link'
     texts = {
         f'is in {_UNITS[unit]}; converted': unit != 1.0,
         'is mirrored (y to the right, or x and y swapped); turned around': fit.mirrored,
         f'is stamped {late(late_s)}; taken into account': late_s != 0,
-        f'lies {sides}{"left" if y > 0 else "right"} of base_link; taken into account': (
-            lever != 0
-        ),
+        f'lies {side}; taken into account': x != 0,
         text: bool(text),
     }
     faults = fault_sentence(TRUTH, ~comparison.used, truth.stamps_ns, 'odometry')
@@ -418,7 +340,7 @@ def _corrected(truth: Trajectory, comparison: _Comparison, fit: _Fit, unit: floa
     if not sentences:
         return TruePoses(truth)
     places = comparison.places.conj() if fit.mirrored else comparison.places
-    places = places - lever * np.exp(1j * yaw)
+    places = places - complex(x, y) * np.exp(1j * yaw)
     poses = np.column_stack([places.real, places.imag, wrap_angle(yaw)])
     stamps_ns = truth.stamps_ns - round(late_s * 1e9)
     kept = Trajectory(stamps_ns[comparison.used], poses[comparison.used])
