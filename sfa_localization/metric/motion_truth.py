@@ -15,7 +15,7 @@ Gauss-Newton, with weights of Student's distribution. Estimates that are judged 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -290,7 +290,8 @@ class _Comparison:
 
         def refitted(free: Mask) -> _Fit:
             theta = np.where(free, fit.theta, 0.0)
-            return self.fitted(fit.mirrored, theta, free, rows, about_s) or fit
+            fitted = self.fitted(fit.mirrored, theta, free, rows, about_s)
+            return fitted or replace(fit, free=free, theta=theta)
 
         fit = refitted(free)
         for _ in range(2):
@@ -352,11 +353,12 @@ class _Comparison:
         if not abs(mean) > ALIKE:
             by_wheels = np.interp(self.seconds, self.seconds[fit.rows], fit.yaw)
             return by_wheels, 'has no headings of base_link; they are not judged', False
-        text = '' if (sign < 0) == fit.mirrored else 'has clockwise headings; turned around'
+        turned = '' if (sign < 0) == fit.mirrored else 'clockwise '
         aside = float(np.angle(mean))
         if abs(aside) < ASIDE:
+            text = f'has {turned}headings; turned around' if turned else ''
             return sign * self.yaw, text, True
-        text = f'has headings {np.rad2deg(aside):+.0f} degrees beside those of base_link; '
+        text = f'has {turned}headings {np.rad2deg(aside):+.0f} degrees beside those of base_link; '
         return sign * self.yaw - aside, text + 'taken into account', True
 
 
@@ -370,6 +372,9 @@ def true_poses(
     """
     comparison, free = _Comparison(truth, track), np.array([True, True, not open_loop, True, True])
     factor = comparison.scale()
+    if factor < 1e-9 and trusted:
+        raise DataError(f'{TRUTH} does not move with the robot: is its topic the right one?')
+    factor = max(factor, 1e-9)
     unit = min(_UNITS, key=lambda unit: abs(np.log(factor / unit)))
     comparison.places /= unit
     comparison.used = ~comparison.faults(None)
