@@ -12,7 +12,7 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo reproduce study test robustness animation map fuzz soak bench lint format colcon matrix clean
+.PHONY: help env demo reproduce study test robustness troubles animation map fuzz soak bench lint format colcon matrix clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -39,6 +39,9 @@ robustness: $(READY)  ## run the tests of faults, write their tables, replay a d
 	$(PY) -m pytest -m robustness $(ARGS)
 	PYTHONPATH=.:test $(PY) -m robustness --frozen
 	PYTHONPATH=.:test $(PY) -m robustness --live --lights
+
+troubles: $(READY)  ## train on recorded drives with each trouble, print errors and what is said (half an hour)
+	PYTHONPATH=.:test $(PY) -m robustness --troubles $(ARGS)
 
 map: $(READY)  ## draw the map of the demo: resource/map.png
 	PYTHONPATH=.:test $(PY) -m study.map_picture demo/model.npz demo/test resource/map.png

@@ -94,7 +94,7 @@ def test_panoramas_of_a_bag_are_leveled_by_its_imu(tmp_path):
                 sent.orientation_covariance[0] = 0.0 if measured else -1.0
                 bag.odometry('/odom', at, (0.1 * k, 0, 0), (0.1, 0), (0, 0))
                 bag.image('/panorama', at, image, 'camera')
-                bag.message('/imu', at, sent)
+                bag.message('/imu', at + late_ns, sent)
         return tmp_path / name
 
     run = read_drive(recorded('bag'), tmp_path / 'cache', recipe)

@@ -18,6 +18,7 @@ from sfa_localization.metric.motion_sources import (
     ENOUGH,
     EQUAL,
     GRID,
+    GYRO,
     IMAGES,
     LATE_S,
     POSE,
@@ -236,6 +237,10 @@ def following(sources: Sequence[Source]) -> str:
         if min(left) > least * (1 - direct.correlation**2):
             return ''
         best = best if number else int(np.argmin(left))
+        # Wheels with bursts of slip look smoothed before and after; no camera turns in advance.
+        pair = pairs[0 if number else best]
+        if others[-1].name != GYRO and pair and (pair.delay_s or 0.0) < -LATE_S:
+            return ''
     if best < 0:
         return ''
     lag_s, fastest, ignored = _FOLLOWERS[best].tolist()

@@ -212,7 +212,9 @@ def _windows(slow: Source, fast: Source, length_s: float) -> Stamps:
 
 
 def typical(x: Array) -> float:
-    """Half of the motion is in steps as large, or larger ones: standing does not count."""
+    """The step of x (N,) so that half of the motion is in steps as large, or larger ones: standing
+    does not count.
+    """
     return quantile(np.abs(x), 0.5, np.abs(x))
 
 

@@ -104,6 +104,9 @@ def main():
         frozen.record(tell)
         return 0
     if options.troubles:
+        unknown = [name for name in options.faults if name not in troubles.TROUBLES]
+        if unknown:
+            parser.error(f'no trouble {unknown[0]!r}; there are: {"; ".join(troubles.TROUBLES)}')
         return tell_troubles(options.faults)
     lies = [*LIES] if options.frozen or options.means else []
     results = {

@@ -440,7 +440,7 @@ TROUBLES = {
     ),
     'images: H.264': Trouble(lambda: {IMAGES: as_video()}, RIGHT_M, 'images: 140 used'),
     'body behind, a quarter': Trouble(
-        lambda: body(0.25), (1.0, 1.0), r'shows the robot: set blind_sectors: \[1[23].*, 2[34]'
+        lambda: body(0.25), (1.0, 1.0), r'shows the robot: set blind_sectors: \[1[23].*, 2[23]'
     ),
     'body behind, the lower half': Trouble(
         lambda: body(0.2, top=0.5, plain=True), (1.0, 1.0), 'the lower [45].% of the view from 1'
