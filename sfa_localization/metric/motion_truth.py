@@ -39,9 +39,8 @@ own truth, 0.2 and more with that of another drive or with mirrored axes."""
 CERTAIN = 12.0
 """Twice the least gain of log-likelihood by a lever arm or a delay: right truths reach 11,
 and one that is 0.1 s late over 28 m 13."""
-LEVER_MIN_M, WAY_MIN_M = 1.6 * TURN_SLIDE, 0.04
-"""Smaller lever arms, and ways during a delay, stay: wheels that slide in turns look like a lever
-arm of TURN_SLIDE."""
+LEVER_MIN_M = 1.6 * TURN_SLIDE
+"""Smaller lever arms stay: wheels that slide in turns look like one of TURN_SLIDE."""
 FAULT_M = 0.1
 """A smaller jump of the truth harms nothing."""
 ASIDE = np.deg2rad(10.0)
@@ -223,9 +222,7 @@ class _Comparison:
 
     def settled(self, fit: _Fit, free: Mask) -> _Fit:
         """The fit with a delay and a lever arm only where they are certain, and matter."""
-        steps = np.diff(self.way)
-        speed = float((steps**2 / np.diff(self.track_s)).sum() / max(steps.sum(), 1e-9))
-        limits = (_LEVER, LEVER_MIN_M), (_DELAY, max(LATE_S, WAY_MIN_M / speed))
+        limits = (_LEVER, LEVER_MIN_M), (_DELAY, LATE_S)
         rows, about_s = np.arange(len(self.seconds)), float(fit.theta[2])
 
         def refitted(theta: Array, free: Mask) -> _Fit | None:
@@ -325,13 +322,13 @@ def _corrected(truth: Trajectory, comparison: _Comparison, fit: _Fit, unit: floa
     """The truth after all corrections; itself if there are none."""
     yaw, text, headings = comparison.headings(fit)
     x, y, late_s, _ = fit.theta.tolist()
-    sides = f'{abs(x):.2f} m {"ahead of" if x > 0 else "behind"} and {abs(y):.2f} m to the '
-    side = f'{sides}{"left" if y > 0 else "right"} of base_link'
+    ahead = f'{abs(x):.2f} m {"ahead of" if x > 0 else "behind"}'
+    side = f'{abs(y):.2f} m to the {"left" if y > 0 else "right"} of base_link'
     texts = {
         f'is in {_UNITS[unit]}; converted': unit != 1.0,
         'is mirrored (y to the right, or x and y swapped); turned around': fit.mirrored,
         f'is stamped {late(late_s)}; taken into account': late_s != 0,
-        f'lies {side}; taken into account': x != 0,
+        f'lies {ahead} and {side}; taken into account': x != 0,
         text: bool(text),
     }
     faults = fault_sentence(TRUTH, ~comparison.used, truth.stamps_ns, 'odometry')
