@@ -62,7 +62,9 @@ class Discovery:
             (name, kind)
             for kind in self._types
             for name, kinds in sorted(self._node.get_topic_names_and_types())
-            if kind in kinds and self._publishers(name) - this_node and self._is_offered(name)
+            if kind in kinds and self._publishers(name) - this_node
+            # Panoramas are an input where an argument of the launch file takes them.
+            if 'panorama' in self._arguments or not self._is_output(name)
         ]
         usable = [n for n, kind in topics if kind == self._types[0] and self._qualifies(n)]
         if self._take is not None and len(usable) == 1:
@@ -88,10 +90,6 @@ class Discovery:
         others = tuple(space for space in spaces if len(space) > len(below))
         usual = name.startswith(below) and not name.startswith(others)
         return usual and not self._is_output(name)
-
-    def _is_offered(self, name: str) -> bool:
-        """Whether an argument of the launch file takes a topic: panoramas are also an input."""
-        return 'panorama' in self._arguments or not self._is_output(name)
 
     def _is_output(self, name: str) -> bool:
         ours = {node for node, _ in self._publishers(name)} & {*NODES, self._node.get_name()}
