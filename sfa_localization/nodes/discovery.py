@@ -37,8 +37,7 @@ class Discovery:
         self._node, self._topic, self._arguments, self._types = node, topic, arguments, types
         self._start_s = steady_s()
         self._expected = node.resolve_topic_name(topic)
-        remapped = self._expected != node.resolve_topic_name(topic, only_expand=True)
-        self._take = None if remapped else take
+        self._take = None if node.is_remapped(topic) else take
         self._has_substitute = False
         self.hint = ''
         """Which topics there are, while nobody publishes on that of the input."""

@@ -179,9 +179,12 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         A remap of the whole name comes first.
         """
         base, _, transport = topic.rpartition('/')
-        full, resolved = map(self.resolve_topic_name, (topic, base))
-        plain = [self.resolve_topic_name(name, only_expand=True) for name in (topic, base)]
-        return topic if full != plain[0] or resolved == plain[1] else f'{resolved}/{transport}'
+        if self.is_remapped(topic) or not self.is_remapped(base):
+            return topic
+        return f'{self.resolve_topic_name(base)}/{transport}'
+
+    def is_remapped(self, topic: str) -> bool:
+        return self.resolve_topic_name(topic) != self.resolve_topic_name(topic, only_expand=True)
 
     def service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
         """A service with the fields success and message, which tells why `callback` failed."""
