@@ -157,7 +157,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         """Log and count each time that the source could not be opened, or was lost."""
         if status.lost > self._losses:
             self._losses = status.lost
-            self._reject(f'{"lost" if self._size else "cannot open"}: {status.problem}')
+            problem = status.problem
+            self._reject(f'lost: {problem}' if self._size else f'cannot open: {problem}')
 
     def _take(self, topic: str) -> None:
         """Take images from a substitute for the input's topic, or again from that itself."""
