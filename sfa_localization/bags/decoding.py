@@ -34,6 +34,7 @@ STAMPED_POSES = (
 POSES = (ODOMETRY, *STAMPED_POSES, TF)
 """Types with a pose of the robot."""
 FIX = 'sensor_msgs/msg/NavSatFix'
+TRUTHS = (*POSES, FIX)
 PLACES = (*STAMPED_POSES[:2], 'geometry_msgs/msg/PointStamped', FIX)
 """Types with a measured point."""
 SERIALIZATIONS = {'cdr': Stores.ROS2_JAZZY, 'ros1': Stores.ROS1_NOETIC}
@@ -83,35 +84,27 @@ def transform_to(frame: str, message: Any, topic: str) -> Any:
     return frames.get(frame.lstrip('/'))
 
 
-def pose_of(message: Any) -> tuple[float, float, float]:
+def pose_of(message: Any, needs_yaw: bool = True) -> tuple[float, float, float]:
     """Planar pose x m, y m, yaw rad of a message or transform; latitude, longitude, 0 of a fix.
-    Raises MessageError.
+
+    A quaternion of zeros counts as yaw 0 if the yaw is not needed. Raises MessageError.
     """
     kind = message.__msgtype__
     if kind == FIX:
         return (*fix_of(message)[:2], 0.0)
-    return read_planar(*_position_and_orientation(message))
-
-
-def true_pose_of(message: Any) -> tuple[float, float, float]:
-    """The same of a ground truth: trackers and receivers without headings leave the quaternion at
-    zero, which counts as yaw 0.
-    """
-    if message.__msgtype__ == FIX:
-        return pose_of(message)
-    position, q = _position_and_orientation(message)
-    if any((q.x, q.y, q.z, q.w)):
+    if kind == 'geometry_msgs/msg/TransformStamped':
+        position, q = message.transform.translation, message.transform.rotation
+    else:
+        pose = message.pose if kind == 'geometry_msgs/msg/PoseStamped' else message.pose.pose
+        position, q = pose.position, pose.orientation
+    if needs_yaw or any((q.x, q.y, q.z, q.w)):
         return read_planar(position, q)
     require_sane('pose', position.x, position.y)
     return float(position.x), float(position.y), 0.0
 
 
-def _position_and_orientation(message: Any) -> tuple[Any, Any]:
-    if message.__msgtype__ == 'geometry_msgs/msg/TransformStamped':
-        return message.transform.translation, message.transform.rotation
-    stamped = message.__msgtype__ == 'geometry_msgs/msg/PoseStamped'
-    pose = message.pose if stamped else message.pose.pose
-    return pose.position, pose.orientation
+true_pose_of = functools.partial(pose_of, needs_yaw=False)
+"""The pose of a ground truth: trackers and receivers without headings leave zeros."""
 
 
 def place_of(message: Any) -> tuple[float, float, float]:

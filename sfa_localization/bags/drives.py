@@ -313,7 +313,7 @@ def _leveled(panoramas: Panoramas, imu: Stream, tilts: StampedValues, sphere: Sp
         raise BagError(f'{missing}: are both stamped by one clock (stamp_source: receive)?')
     if lost:
         logger.warning('%s: these are not leveled', missing)
-    return LeveledPanoramas(panoramas, np.nan_to_num(image_tilts), sphere)
+    return LeveledPanoramas.of(panoramas, np.nan_to_num(image_tilts), sphere)
 
 
 def _require_covered(images: Stream, covered: NDArray[np.bool_], near_s: float) -> None:

@@ -75,10 +75,8 @@ def add_problem(problems: list[str], text: str) -> None:
 
 def describe(error: Exception) -> str:
     """The text of an error, or its class."""
-    return (
-        short_line(str(getattr(error, 'strerror', None) or error)).rstrip('.')
-        or type(error).__name__
-    )
+    text = getattr(error, 'strerror', None) or str(error)
+    return short_line(text).rstrip('.') or type(error).__name__
 
 
 class McapFile:

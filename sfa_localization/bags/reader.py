@@ -25,12 +25,12 @@ from sfa_localization.bags.topic_stream import Item, Stream
 from sfa_localization.camera.video import ImageReader
 from sfa_localization.data.errors import BagError, DataError, LocalizationError, MessageError
 from sfa_localization.data.messages import NO_STAMP, read_stamp
+from sfa_localization.data.rejections import listed
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory
 
 PUBLISHED = re.compile(r'/(ekf|sfa)/|/panorama(/compressed)?$')
 """Topics of omnicam_node, sfa_node and ekf_node; an input is preferred to them."""
 REMEDY = 'try `mcap recover` on its files, or `ros2 bag reindex`'
-_LISTED = 8  # topics of an error message
 
 
 class Kind(NamedTuple):
@@ -50,9 +50,7 @@ KINDS = {
     'odometry': Kind('odometry', '--odom-topic', (decoding.ODOMETRY,), decoding.POSES),
     'imu': Kind('yaw rates', '--imu-topic', (decoding.IMU,), (decoding.IMU,)),
     'points_topic': Kind('measured places', '--points-topic', decoding.PLACES, decoding.PLACES),
-    'ground_truth': Kind(
-        'true poses', '--ground-truth-topic', _TRUTH, (*decoding.POSES, decoding.FIX)
-    ),
+    'ground_truth': Kind('true poses', '--ground-truth-topic', _TRUTH, decoding.TRUTHS),
 }
 
 
@@ -126,8 +124,8 @@ class Bag:
     def _contents(self, wanted: Kind) -> str:
         """The topics that the bag has, and the remedy."""
         names = sorted(f'{t.name} ({_short([t.kind])}, {t.count})' for t in self.topics.values())
-        listed = ', '.join(names[:_LISTED] + ['...'] * (len(names) > _LISTED)) or 'no topics'
-        return f'it has {listed}: record one, or name one with {wanted.flag}'
+        has = listed(names) or 'no topics'
+        return f'it has {has}: record one, or name one with {wanted.flag}'
 
     def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
         """Stamps and images (H, W, 3) BGR, one at a time."""

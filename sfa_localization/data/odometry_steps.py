@@ -74,7 +74,7 @@ def learned(noise: float, distance: float) -> float:
 
 
 class _Message(NamedTuple):
-    """A message that ends a path: its number among all, seconds, pose, v m/s and omega rad/s."""
+    """A message: its number, and that of the first on its path; v m/s and omega rad/s."""
 
     path: int
     number: int
@@ -91,7 +91,7 @@ class Paths:
 
     def __init__(self, noise: float = NOISE_START) -> None:
         self._ends: list[_Message] = []  # of the paths; that of the last message comes last
-        self._messages, self._paths, self._returned = 0, 0, -1
+        self._messages, self._returned = 0, -1
         self.noise, self._share = noise, 0.0
         self.aside = 0
         """Number of messages that the last one shows to be beside its path."""
@@ -104,34 +104,26 @@ class Paths:
     def add(self, seconds: float, pose: Sequence[float], v: float, omega: float) -> int:
         """Take a message with a pose x m, y m, yaw rad; returns the number of its path."""
         ends = [end for end in self._ends if seconds - end.seconds < RETURN_S]
-        message = _Message(self._paths, self._messages, seconds, pose, (v, omega))
-        best, least = None, math.inf
+        message = _Message(self._messages, self._messages, seconds, pose, (v, omega))
+        self._messages, self.aside = self._messages + 1, 0
         for end in reversed(ends):
             distance = _distance(end, message)
-            excess = distance - float(tolerance(seconds - end.seconds, self.noise))
-            if excess < least and least > 0:
-                best, least, nearest = end, excess, distance
-        if best is not None:
-            self.noise = learned(self.noise, nearest)
-        self._paths += least > 0
-        self.aside = 0
-        if best is not None and least <= 0:
-            message = message._replace(path=best.path)
-            self._continued(best, message, best is ends[-1])
-        self._messages += 1
-        others = [end for end in ends if end.path != message.path]
-        self._ends = [*others[-2:], message]
+            if distance <= tolerance(seconds - end.seconds, self.noise):
+                self.noise = learned(self.noise, distance)
+                message = message._replace(path=end.path)
+                if end.pose != message.pose:
+                    self._continued(end, message.number - end.number - 1)
+                break
+        self._ends = [*[end for end in ends if end.path != message.path][-2:], message]
         return message.path
 
-    def _continued(self, end: _Message, message: _Message, is_last: bool) -> None:
-        """Take into account that a message continues a path, perhaps after others."""
-        if end.pose == message.pose:
-            return
-        changed = not is_last and self._returned != end.path
+    def _continued(self, end: _Message, others: int) -> None:
+        """Take into account that a path goes on, after messages of others."""
+        changed = others > 0 and self._returned != end.path
         self._share += (changed - self._share) / _MEMORY
-        if not is_last:
+        if others:
             self._returned = end.path
-            self.aside = 0 if self.in_turn else message.number - end.number - 1
+            self.aside = 0 if self.in_turn else others
 
 
 def _distance(end: _Message, message: _Message) -> float:
@@ -154,16 +146,16 @@ def beside(seconds: Array, poses: Array, twists: Array) -> tuple[Mask, float]:
 
     `seconds` (N,) increase; `poses` (N, 3) are x m, y m, yaw rad, `twists` (N, 2) m/s and rad/s.
     """
-    aside, noise, in_turn = np.zeros(len(poses), bool), NOISE_START, 0
+    aside, path, noise = np.zeros(len(poses), bool), np.zeros(len(poses), np.int64), NOISE_START
+    if not len(poses):
+        return aside, 0.0
     for _ in range(2):  # the first time shows the noise
-        paths, number, in_turn = Paths(noise), [], 0
-        for row in zip(seconds.tolist(), poses.tolist(), *twists.T.tolist(), strict=True):
-            number.append(paths.add(*row))
+        paths, in_turn = Paths(noise), 0
+        messages = zip(seconds.tolist(), poses.tolist(), *twists.T.tolist(), strict=True)
+        for k, message in enumerate(messages):
+            path[k] = paths.add(*message)
             in_turn += paths.in_turn
         noise = paths.noise
-        if len({*number}) < 2:
-            return aside, 0.0
-    path = np.array(number, np.int64)
     order = np.argsort(path, kind='stable')
     of_path = np.split(order, np.flatnonzero(np.diff(path[order])) + 1)
     lengths = [float(np.hypot(*np.diff(poses[rows, :2], axis=0).T).sum()) for rows in of_path]

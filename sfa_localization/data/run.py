@@ -153,7 +153,7 @@ class Count:
 
 class Panoramas(Protocol):
     """The images of a run, read from disk in batches: stamps (N,), and the shape (H, W, C) of each,
-    BGR uint8.
+    BGR uint8. Those of a Run are dataclasses.
     """
 
     @property
@@ -200,27 +200,6 @@ class PanoramaArray:
     def batches(self, size: int) -> Iterator[Image]:
         for start in range(0, len(self), size):
             yield self.read(start, min(start + size, len(self)))
-
-
-@dataclass(frozen=True, slots=True)
-class StampedPanoramas:
-    """Panoramas with other stamps (N,)."""
-
-    stamps_ns: Stamps
-    panoramas: Panoramas
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        return self.panoramas.shape
-
-    def __len__(self) -> int:
-        return len(self.panoramas)
-
-    def read(self, start: int, stop: int) -> Image:
-        return self.panoramas.read(start, stop)
-
-    def batches(self, size: int) -> Iterator[Image]:
-        return self.panoramas.batches(size)
 
 
 @dataclass(frozen=True, slots=True)
