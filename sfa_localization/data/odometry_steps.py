@@ -127,17 +127,16 @@ class Paths:
 
 
 def _distance(end: _Message, message: _Message) -> float:
-    """How far a message, m or rad, is from where the speeds lead from the end of a path."""
-    seconds = message.seconds - end.seconds
+    """How far a message, m or rad, is `beyond` the speeds from the end of a path."""
     dx, dy, turn = (b - a for a, b in zip(end.pose, message.pose, strict=True))
     c, s, turn = math.cos(end.pose[2]), math.sin(end.pose[2]), math.remainder(turn, math.tau)
-    way, twists = (dx * c + dy * s, dy * c - dx * s), (end.twist, message.twist)
-    near = min(max(math.dist(way, (v * seconds, 0.0)), abs(turn - w * seconds)) for v, w in twists)
-    if near < JUMP:
-        return near
-    longest_s = seconds + _STALE_S
-    moved = beyond(way, longest_s, [(v, 0.0) for v, _ in twists])
-    return max(float(moved), float(beyond([turn], longest_s, [(w,) for _, w in twists])))
+    longest_s, twists = message.seconds - end.seconds + _STALE_S, (end.twist, message.twist)
+
+    def missed(step: float, speed: float) -> float:
+        return step - sorted((0.0, step, speed * longest_s))[1]
+
+    moved = min(math.hypot(missed(dx * c + dy * s, v), dy * c - dx * s) for v, _ in twists)
+    return max(moved, min(abs(missed(turn, omega)) for _, omega in twists))
 
 
 def beside(seconds: Array, poses: Array, twists: Array) -> tuple[Mask, float]:
