@@ -21,7 +21,7 @@ from sfa_localization.bags.motion_arrays import StampedValues
 from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.satellite_fixes import in_plane
 from sfa_localization.bags.settings import BagConfig
-from sfa_localization.bags.topic_stream import Item, Stream
+from sfa_localization.bags.topic_stream import Stream, Used
 from sfa_localization.camera.video import ImageReader
 from sfa_localization.data.errors import BagError, DataError, LocalizationError, MessageError
 from sfa_localization.data.messages import NO_STAMP, read_stamp
@@ -171,7 +171,7 @@ class Bag:
             stream.images = ImageReader(_short([self.topics[topic].kind]))
         return stream
 
-    def read(self, streams: Iterable[Stream]) -> Iterator[tuple[Stream, int, Any]]:
+    def read(self, streams: Iterable[Stream]) -> Iterator[Used]:
         """Read the streams' topics in one pass: stream, stamp in ns, value.
 
         Raises BagError when a topic has no usable message, or in strict reading on any loss.
@@ -183,13 +183,11 @@ class Bag:
             receive_ns = record[1]
             for stream in by_topic[record[0].name]:
                 stream.received += 1
-                for item in stream.values(self._parts(stream, *record), receive_ns):
-                    yield from _used(stream, stream.push(item))
+                yield from stream.take(self._parts(stream, *record), receive_ns)
         for stream in itertools.chain(*by_topic.values()):
-            delayed = stream.images.finish() if stream.images else []
-            for item in stream.values(delayed, receive_ns):
-                yield from _used(stream, stream.push(item))
-            yield from _used(stream, stream.flush())
+            if stream.images:
+                yield from stream.take(stream.images.finish(), receive_ns)
+            yield from stream.flush()
             self._check_complete(stream)
 
     def _parts(
@@ -245,12 +243,6 @@ class Bag:
     def _raise_problems(self) -> None:
         if self.strict and self.problems:
             raise BagError(f'{self.path}: {self.problems[0]}; read without --strict to salvage it')
-
-
-def _used(stream: Stream, items: Iterable[Item]) -> Iterator[tuple[Stream, int, Any]]:
-    for item in items:
-        stream.used += 1
-        yield stream, item.stamp_ns, item.value
 
 
 def _short(kinds: Iterable[str], between: str = '') -> str:
