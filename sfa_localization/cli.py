@@ -45,9 +45,7 @@ OPTIONAL = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command or node that this executable, or else the first argument, is named after;
-    return the exit code.
-    """
+    """Run what this executable, or the first argument, is named after; return the exit code."""
     _prepare_streams()
     if argv is None:
         called = Path(sys.argv[0]).stem

@@ -1,9 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a bag: decoded by rosbags, and the values of their fields.
-
-A CompressedVideo has a header, too.
-"""
+"""Messages of a bag: decoded by rosbags, and the values of their fields."""
 
 from __future__ import annotations
 
@@ -63,7 +60,7 @@ def can_decode(topic: Topic) -> bool:
 
 
 def decode(data: bytes, topic: Topic) -> Any:
-    """A message of a topic. Raises MessageError for damaged data."""
+    """A message of a topic; a CompressedVideo gets a header. Raises MessageError if damaged."""
     types = typestore(SERIALIZATIONS[topic.serialization])
     ros1 = topic.serialization == 'ros1'
     try:
@@ -108,9 +105,7 @@ true_pose_of = functools.partial(pose_of, needs_yaw=False)
 
 
 def place_of(message: Any) -> tuple[float, float, float]:
-    """Place x m, y m, or latitude and longitude of a fix, and its standard deviation, m, 0 where
-    unknown. Raises MessageError.
-    """
+    """Place x m, y m, or degrees of a fix, and its std, m, 0 if unknown. Raises MessageError."""
     kind, variance = message.__msgtype__, 0.0
     if kind == FIX:
         return fix_of(message)
@@ -126,9 +121,7 @@ def place_of(message: Any) -> tuple[float, float, float]:
 
 
 def odometry_of(message: Any) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
-    """Pose, NaN where an Odometry is not filled with one, and of an Odometry v, omega and their
-    variances; other types have no twist.
-    """
+    """Pose, NaN where not filled, and of an Odometry, v, omega and variances, else None."""
     if message.__msgtype__ != ODOMETRY:
         return pose_of(message), None
     pose, twist = read_odometry(message)

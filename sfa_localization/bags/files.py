@@ -147,9 +147,7 @@ class McapFile:
             self.topics[key] = make_topic(*fields, counts.get(key, 0))
 
     def _parts(self, start_ns: int) -> Iterator[list[Any]]:
-        """The records of each chunk that ends at or after `start_ns`, and each record outside of
-        chunks, up to the first unreadable one. Damaged chunks are skipped.
-        """
+        """Records of each chunk that ends at or after `start_ns`, and of others, up to damage."""
         self._file.seek(0)
         reader = StreamReader(self._file, emit_chunks=True, record_size_limit=_LARGEST)
         with suppress(Exception):  # as above

@@ -143,9 +143,7 @@ class Bag:
         return ((stamp_ns, value) for _, stamp_ns, value in self.read([stream]))
 
     def to_odometry(self, stream: Stream, values: StampedValues) -> Odometry:
-        """Odometry from a stream's values; oddities are noted as problems, and faulty messages are
-        counted as skipped. Raises BagError for two publishers.
-        """
+        """Odometry of values; counts faults. Raises BagError for two publishers."""
         try:
             odometry, oddities, faults = motion.to_odometry(values, stream.topic)
         except DataError as error:

@@ -113,9 +113,7 @@ def replaced_mode(path: Path) -> int:
 
 
 def require_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
-    """Raise LocalizationError before the work where atomic_write could not write its results, or
-    where they would replace each other or an input.
-    """
+    """Raise LocalizationError if an output cannot be written, or replaces another or an input."""
     targets: set[Path] = set()
     for path in outputs:
         if resolved(path) in targets:

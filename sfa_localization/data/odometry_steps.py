@@ -67,9 +67,7 @@ def tolerance(seconds: ArrayLike, noise: float) -> Array:
 
 
 def learned(noise: float, distance: float) -> float:
-    """The standard deviation of steps after another one at this distance `beyond` the speed: their
-    running 68 % quantile.
-    """
+    """The running 68 % quantile, `noise`, after another step at a distance `beyond` the speed."""
     return max(noise * math.exp(_LEARNING * (0.68 - (distance <= noise))), _NOISE_LEAST)
 
 
