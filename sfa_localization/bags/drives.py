@@ -277,9 +277,7 @@ def _read(
 
 
 def _by_one_clock(bag: Bag, streams: dict[str, Stream], values: dict[str, StampedValues]) -> int:
-    """Stamp the values by the clock of the odometry, where their reception shows another one; log
-    it, and return by how much, ns, the stamps of the images are ahead of it.
-    """
+    """Stamp values by the clock of the odometry and log it; return how far images are ahead, ns."""
     images_ns = 0
     for use, stream in streams.items():
         if use in _STAMPED_AT_ONCE:
