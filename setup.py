@@ -84,8 +84,8 @@ setup(
     entry_points={
         'console_scripts': [
             f'{NAME} = {NAME}.__main__:main',
-            *(f'{command} = {NAME}.__main__:executable' for command in COMMANDS if IN_WORKSPACE),
-            *(f'{node} = {NAME}.__main__:executable' for node in NODES),
+            *(f'{command} = {NAME}.__main__:main' for command in COMMANDS if IN_WORKSPACE),
+            *(f'{node} = {NAME}.__main__:main' for node in NODES),
         ],
     },
 )

@@ -45,9 +45,12 @@ OPTIONAL = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command or node named by the first argument; return the exit code."""
+    """Run what this executable, or the first argument, is named after; return the exit code."""
     _prepare_streams()
-    words = list(sys.argv[1:] if argv is None else argv)
+    if argv is None:
+        called = Path(sys.argv[0]).stem
+        argv = [called] * (called in {*COMMANDS, *NODES}) + sys.argv[1:]
+    words = list(argv)
     name = words[0] if words else ''
     for number in (signal.SIGTERM, signal.SIGHUP) if name not in NODES else ():
         if signal.getsignal(number) != signal.SIG_IGN:  # as after nohup
@@ -85,11 +88,6 @@ def _flush() -> None:
         if isinstance(error, BrokenPipeError):
             raise
         raise LocalizationError(f'standard output: cannot be written: {error.strerror}') from None
-
-
-def executable() -> int:
-    """Run the command with the name of this executable, for `ros2 run sfa_localization`."""
-    return main([Path(sys.argv[0]).stem, *sys.argv[1:]])
 
 
 def command_parser(name: str) -> argparse.ArgumentParser:

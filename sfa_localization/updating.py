@@ -204,7 +204,7 @@ def _textures(
         return np.zeros((0, 0, 0), np.int8)
     read = np.concatenate([model.masked(images.read(i, i + 1)) for i in chosen.tolist()])
     masked = PanoramaArray(images.stamps_ns[chosen], read)
-    leveled = LeveledPanoramas(masked, tilts, model.keyframes.sphere)
+    leveled = LeveledPanoramas.of(masked, tilts, model.keyframes.sphere)
     return quantized(np.stack([texture(image) for image in leveled.read(0, len(chosen))]))
 
 

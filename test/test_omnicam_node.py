@@ -6,9 +6,9 @@ import array
 import dataclasses
 import itertools
 import sys
+from collections import namedtuple
 from contextlib import suppress
 from types import SimpleNamespace
-from typing import NamedTuple
 from unittest import mock
 
 import cv2
@@ -25,7 +25,6 @@ from sfa_localization.camera.settings import CameraConfig, LensCalibration, Pano
 
 pytest.importorskip('rclpy')
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Quaternion
 from rclpy.parameter import Parameter
@@ -59,13 +58,8 @@ def raw_picture(seed=1):
     return cv2.resize(noise, (640, 640), interpolation=cv2.INTER_CUBIC)
 
 
-class CompressedVideo(NamedTuple):
-    """As in foxglove_msgs, which wheels of ROS lack."""
-
-    timestamp: Time
-    frame_id: str
-    data: bytes
-    format: str
+CompressedVideo = namedtuple('CompressedVideo', 'timestamp frame_id data format')
+"""As in foxglove_msgs, which wheels of ROS lack."""
 
 
 def message(seed=1, stamp_ns=STAMP_NS):

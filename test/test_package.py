@@ -227,7 +227,7 @@ def test_only_what_is_needed_is_imported(code, unwanted):
 def test_an_executable_runs_the_command_it_is_named_after(monkeypatch, capsys):
     """And a wrong command ends with exit code 2."""
     monkeypatch.setattr(sys, 'argv', ['/workspace/lib/sfa_localization/config'])
-    assert cli.executable() == 0
+    assert cli.main() == 0
     assert 'ekf_node:' in capsys.readouterr().out
     for words in ([], ['trian'], ['--', 'train']):
         with pytest.raises(SystemExit) as raised:
@@ -276,14 +276,13 @@ class Finder:
 sys.meta_path.insert(0, Finder)
 sys.argv = ['/bin/ekf_node']
 from sfa_localization import __main__
-sys.exit(__main__.{}())
+sys.exit(__main__.main())
 """
 
 
-@pytest.mark.parametrize('start', ['main', 'executable'])
 @pytest.mark.parametrize('module', ['sfa_localization.cli', 'sfa_localization.nodes.entry'])
-def test_ctrl_c_while_python_imports_leaves_no_traceback(module, start):
-    command = [sys.executable, '-c', INTERRUPTED.format(module, start)]
+def test_ctrl_c_while_python_imports_leaves_no_traceback(module):
+    command = [sys.executable, '-c', INTERRUPTED.format(module)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 

@@ -3,6 +3,7 @@
 """Images of H.264 and H.265 video: each with its stamp, and none with what a lost packet leaves."""
 
 import sys
+from collections import Counter
 from fractions import Fraction
 from types import SimpleNamespace
 
@@ -39,12 +40,10 @@ def encoded(count=24, codec='libx264', between=0, key_every=8):
     encoder = av.CodecContext.create(codec, 'w')
     encoder.width, encoder.height = SIZE
     encoder.pix_fmt, encoder.time_base = 'yuv420p', Fraction(1, 10)
-    size = {'crf': '10', 'g': str(key_every), 'bf': str(between)}
-    quiet = f'log-level=none:keyint={key_every}:min-keyint={key_every}:bframes={between}'
-    fast = {'preset': 'ultrafast'} if not between else {'preset': 'medium', 'sc_threshold': '0'}
-    encoder.options = fast | size | ({'x265-params': quiet} if codec == 'libx265' else {})
-    if not between:
-        encoder.options |= {'tune': 'zerolatency'}
+    hevc = f'log-level=none:keyint={key_every}:min-keyint={key_every}:bframes={between}:b-adapt=0'
+    encoder.options = {'preset': 'ultrafast', 'crf': '10', 'g': str(key_every), 'bf': str(between)}
+    encoder.options |= {'x265-params': hevc} if codec == 'libx265' else {}
+    encoder.options |= {} if between else {'tune': 'zerolatency'}
     packets = []
     for number in range(count):
         frame = av.VideoFrame.from_ndarray(scene(number), format='bgr24').reformat(format='yuv420p')
@@ -56,18 +55,17 @@ def encoded(count=24, codec='libx264', between=0, key_every=8):
 def read(packets, format='h264', stamps=None):
     """Numbers of the images that packets show, by stamp; and the numbers of reasons without one."""
     reader, results = ImageReader('CompressedImage'), []
-    for place, (number, data) in enumerate(packets):
-        stamp_ns = START + STEP * (number if stamps is None else stamps[place])
-        results += reader.add(stamp_ns, SimpleNamespace(format=format, data=data))
+    for stamp, (_, data) in zip(stamps or [n for n, _ in packets], packets, strict=True):
+        results += reader.add(stamp + 1, SimpleNamespace(format=format, data=data))
     results += reader.finish()
-    shown, reasons = {}, {}
+    shown, reasons = {}, Counter()
     for stamp_ns, image in results:
         if isinstance(image, CameraError):
-            reasons[str(image)] = reasons.get(str(image), 0) + 1
-        else:
-            errors = [np.abs(image.astype(int) - scene(n)).mean() for n in range(24)]
-            assert min(errors) < 12, 'smeared'
-            shown[(stamp_ns - START) // STEP] = int(np.argmin(errors))
+            reasons[str(image)] += 1
+            continue
+        errors = [np.abs(image.astype(int) - scene(n)).mean() for n in range(24)]
+        assert min(errors) < 12, 'smeared'
+        shown[stamp_ns - 1] = int(np.argmin(errors))
     assert len(results) == len(packets)
     return shown, reasons
 

@@ -1,9 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a bag: decoded by rosbags, and the values of their fields.
-
-A CompressedVideo has a header, too.
-"""
+"""Messages of a bag: decoded by rosbags, and the values of their fields."""
 
 from __future__ import annotations
 
@@ -34,6 +31,7 @@ STAMPED_POSES = (
 POSES = (ODOMETRY, *STAMPED_POSES, TF)
 """Types with a pose of the robot."""
 FIX = 'sensor_msgs/msg/NavSatFix'
+TRUTHS = (*POSES, FIX)
 PLACES = (*STAMPED_POSES[:2], 'geometry_msgs/msg/PointStamped', FIX)
 """Types with a measured point."""
 SERIALIZATIONS = {'cdr': Stores.ROS2_JAZZY, 'ros1': Stores.ROS1_NOETIC}
@@ -62,7 +60,7 @@ def can_decode(topic: Topic) -> bool:
 
 
 def decode(data: bytes, topic: Topic) -> Any:
-    """A message of a topic. Raises MessageError for damaged data."""
+    """A message of a topic; a CompressedVideo gets a header. Raises MessageError if damaged."""
     types = typestore(SERIALIZATIONS[topic.serialization])
     ros1 = topic.serialization == 'ros1'
     try:
@@ -83,41 +81,31 @@ def transform_to(frame: str, message: Any, topic: str) -> Any:
     return frames.get(frame.lstrip('/'))
 
 
-def pose_of(message: Any) -> tuple[float, float, float]:
+def pose_of(message: Any, needs_yaw: bool = True) -> tuple[float, float, float]:
     """Planar pose x m, y m, yaw rad of a message or transform; latitude, longitude, 0 of a fix.
-    Raises MessageError.
+
+    A quaternion of zeros counts as yaw 0 if the yaw is not needed. Raises MessageError.
     """
     kind = message.__msgtype__
     if kind == FIX:
         return (*fix_of(message)[:2], 0.0)
-    return read_planar(*_position_and_orientation(message))
-
-
-def true_pose_of(message: Any) -> tuple[float, float, float]:
-    """The same of a ground truth: trackers and receivers without headings leave the quaternion at
-    zero, which counts as yaw 0.
-    """
-    if message.__msgtype__ == FIX:
-        return pose_of(message)
-    position, q = _position_and_orientation(message)
-    if any((q.x, q.y, q.z, q.w)):
+    if kind == 'geometry_msgs/msg/TransformStamped':
+        position, q = message.transform.translation, message.transform.rotation
+    else:
+        pose = message.pose if kind == 'geometry_msgs/msg/PoseStamped' else message.pose.pose
+        position, q = pose.position, pose.orientation
+    if needs_yaw or any((q.x, q.y, q.z, q.w)):
         return read_planar(position, q)
     require_sane('pose', position.x, position.y)
     return float(position.x), float(position.y), 0.0
 
 
-def _position_and_orientation(message: Any) -> tuple[Any, Any]:
-    if message.__msgtype__ == 'geometry_msgs/msg/TransformStamped':
-        return message.transform.translation, message.transform.rotation
-    stamped = message.__msgtype__ == 'geometry_msgs/msg/PoseStamped'
-    pose = message.pose if stamped else message.pose.pose
-    return pose.position, pose.orientation
+true_pose_of = functools.partial(pose_of, needs_yaw=False)
+"""The pose of a ground truth: trackers and receivers without headings leave zeros."""
 
 
 def place_of(message: Any) -> tuple[float, float, float]:
-    """Place x m, y m, or latitude and longitude of a fix, and its standard deviation, m, 0 where
-    unknown. Raises MessageError.
-    """
+    """Place x m, y m, or degrees of a fix, and its std, m, 0 if unknown. Raises MessageError."""
     kind, variance = message.__msgtype__, 0.0
     if kind == FIX:
         return fix_of(message)
@@ -133,9 +121,7 @@ def place_of(message: Any) -> tuple[float, float, float]:
 
 
 def odometry_of(message: Any) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
-    """Pose, NaN where an Odometry is not filled with one, and of an Odometry v, omega and their
-    variances; other types have no twist.
-    """
+    """Pose, NaN where not filled, and of an Odometry, v, omega and variances, else None."""
     if message.__msgtype__ != ODOMETRY:
         return pose_of(message), None
     pose, twist = read_odometry(message)

@@ -30,15 +30,7 @@ from sfa_localization.data.errors import BagError, DataError, MessageError, Mode
 from sfa_localization.data.files import replaced_mode
 from sfa_localization.data.messages import read_tilt, read_yaw_rate
 from sfa_localization.data.progress import progress_bar
-from sfa_localization.data.run import (
-    Image,
-    Origin,
-    PanoramaArray,
-    Panoramas,
-    Points,
-    Run,
-    Stamps,
-)
+from sfa_localization.data.run import Image, Origin, PanoramaArray, Panoramas, Points, Run, Stamps
 from sfa_localization.data.sphere import Sphere
 
 ODOMETRY_TOLERANCE_S = 0.5
@@ -82,9 +74,7 @@ def as_live(recipe: R, panorama: PanoramaConfig, mount_rpy: tuple[float, ...] = 
 
 
 def image_folder(output: Path) -> Path:
-    """The folder of `output`, for temporary files of images. Raises ModelError where `output` could
-    not be written.
-    """
+    """The folder of `output`, for temporary files. Raises ModelError if it cannot be written."""
     try:
         replaced_mode(output)
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -198,9 +188,7 @@ def _measured(
 
 
 def _is_ready(bag: Bag, topic: str) -> bool:
-    """Whether images are those of omnicam_node, which also publishes their geometry: it has mounted
-    and masked the camera.
-    """
+    """Whether images are of omnicam_node, which mounts and masks them and publishes its info."""
     return f'{topic.removesuffix("/compressed")}/info' in bag.topics
 
 
@@ -289,9 +277,7 @@ def _read(
 
 
 def _by_one_clock(bag: Bag, streams: dict[str, Stream], values: dict[str, StampedValues]) -> int:
-    """Stamp the values by the clock of the odometry, where their reception shows another one; log
-    it, and return by how much, ns, the stamps of the images are ahead of it.
-    """
+    """Stamp values by the clock of the odometry and log it; return how far images are ahead, ns."""
     images_ns = 0
     for use, stream in streams.items():
         if use in _STAMPED_AT_ONCE:
@@ -313,7 +299,7 @@ def _leveled(panoramas: Panoramas, imu: Stream, tilts: StampedValues, sphere: Sp
         raise BagError(f'{missing}: are both stamped by one clock (stamp_source: receive)?')
     if lost:
         logger.warning('%s: these are not leveled', missing)
-    return LeveledPanoramas(panoramas, np.nan_to_num(image_tilts), sphere)
+    return LeveledPanoramas.of(panoramas, np.nan_to_num(image_tilts), sphere)
 
 
 def _require_covered(images: Stream, covered: NDArray[np.bool_], near_s: float) -> None:
@@ -331,9 +317,7 @@ def _require_covered(images: Stream, covered: NDArray[np.bool_], near_s: float) 
 
 
 def images_at(bag: Path, stamps_ns: Collection[int], recipe: ReadingRecipe) -> dict[int, Image]:
-    """The camera's images (H, W, 3) of a bag, by those of the stamps that are within a millisecond
-    of an image. Raises BagError.
-    """
+    """Images (H, W, 3) of a bag, by stamps within a millisecond of theirs. Raises BagError."""
     images: dict[int, Image] = {}
     with Bag(bag, config=recipe.bag) as opened:
         for stamp_ns, image in opened.images(recipe.topics.image) if stamps_ns else ():

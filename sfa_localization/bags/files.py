@@ -75,10 +75,8 @@ def add_problem(problems: list[str], text: str) -> None:
 
 def describe(error: Exception) -> str:
     """The text of an error, or its class."""
-    return (
-        short_line(str(getattr(error, 'strerror', None) or error)).rstrip('.')
-        or type(error).__name__
-    )
+    text = getattr(error, 'strerror', None) or str(error)
+    return short_line(text).rstrip('.') or type(error).__name__
 
 
 class McapFile:
@@ -149,9 +147,7 @@ class McapFile:
             self.topics[key] = make_topic(*fields, counts.get(key, 0))
 
     def _parts(self, start_ns: int) -> Iterator[list[Any]]:
-        """The records of each chunk that ends at or after `start_ns`, and each record outside of
-        chunks, up to the first unreadable one. Damaged chunks are skipped.
-        """
+        """Records of each chunk that ends at or after `start_ns`, and of others, up to damage."""
         self._file.seek(0)
         reader = StreamReader(self._file, emit_chunks=True, record_size_limit=_LARGEST)
         with suppress(Exception):  # as above

@@ -98,21 +98,18 @@ def _empty(rows: Array) -> Mask:
 
 
 def _filled(odometry: Odometry) -> tuple[Odometry, str]:
-    """Odometry with poses integrated from the twist where there are none, and a sentence on that;
-    '' for none.
-    """
+    """Odometry with twists integrated where there are no poses, and a sentence on that or ''."""
     stamps, poses, twists = odometry.stamps_ns, odometry.poses, odometry.twists
-    lacks, drives = np.isnan(poses[:, 0]), np.abs(twists[:, 0]).max(initial=0) > _DRIVING_MPS
+    lacks, drives = np.isnan(poses[:, :1]), np.abs(twists[:, 0]).max(initial=0) > _DRIVING_MPS
+    if lacks.any():
+        count = f'{lacks.sum()} of {len(stamps)} messages'
+        text = f'{count} have no pose (NaN, or a quaternion of zeros)'
+    elif len(stamps) > 1 and drives and not np.ptp(poses, axis=0).any():
+        lacks, text = ~lacks, 'the pose is constant'
+    else:
+        return odometry, ''
     by_twist = integrate(stamps, twists)
-    if not lacks.any():
-        constant = len(stamps) > 1 and drives and not np.ptp(poses, axis=0).any()
-        text = 'the pose is constant; the twist is integrated instead'
-        return (replace(odometry, poses=by_twist), text) if constant else (odometry, '')
     step, integrated = relative(poses[:-1], poses[1:]), relative(by_twist[:-1], by_twist[1:])
-    step = np.where(np.isnan(step[:, :1]), integrated, step)
-    start = np.zeros(3) if lacks[0] else poses[0]
-    text = (
-        f'{lacks.sum()} of {len(stamps)} messages have no pose (NaN, or a quaternion of zeros); '
-        'the twist is integrated instead'
-    )
-    return replace(odometry, poses=chained(start, step)), text
+    step = np.where(lacks[1:] | np.isnan(step), integrated, step)
+    poses = chained(np.zeros(3) if lacks[0] else poses[0], step)
+    return replace(odometry, poses=poses), f'{text}; the twist is integrated instead'

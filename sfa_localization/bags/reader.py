@@ -21,16 +21,16 @@ from sfa_localization.bags.motion_arrays import StampedValues
 from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.satellite_fixes import in_plane
 from sfa_localization.bags.settings import BagConfig
-from sfa_localization.bags.topic_stream import Item, Stream
+from sfa_localization.bags.topic_stream import Stream, Used
 from sfa_localization.camera.video import ImageReader
 from sfa_localization.data.errors import BagError, DataError, LocalizationError, MessageError
 from sfa_localization.data.messages import NO_STAMP, read_stamp
+from sfa_localization.data.rejections import listed
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory
 
 PUBLISHED = re.compile(r'/(ekf|sfa)/|/panorama(/compressed)?$')
 """Topics of omnicam_node, sfa_node and ekf_node; an input is preferred to them."""
 REMEDY = 'try `mcap recover` on its files, or `ros2 bag reindex`'
-_LISTED = 8  # topics of an error message
 
 
 class Kind(NamedTuple):
@@ -50,9 +50,7 @@ KINDS = {
     'odometry': Kind('odometry', '--odom-topic', (decoding.ODOMETRY,), decoding.POSES),
     'imu': Kind('yaw rates', '--imu-topic', (decoding.IMU,), (decoding.IMU,)),
     'points_topic': Kind('measured places', '--points-topic', decoding.PLACES, decoding.PLACES),
-    'ground_truth': Kind(
-        'true poses', '--ground-truth-topic', _TRUTH, (*decoding.POSES, decoding.FIX)
-    ),
+    'ground_truth': Kind('true poses', '--ground-truth-topic', _TRUTH, decoding.TRUTHS),
 }
 
 
@@ -126,8 +124,8 @@ class Bag:
     def _contents(self, wanted: Kind) -> str:
         """The topics that the bag has, and the remedy."""
         names = sorted(f'{t.name} ({_short([t.kind])}, {t.count})' for t in self.topics.values())
-        listed = ', '.join(names[:_LISTED] + ['...'] * (len(names) > _LISTED)) or 'no topics'
-        return f'it has {listed}: record one, or name one with {wanted.flag}'
+        has = listed(names) or 'no topics'
+        return f'it has {has}: record one, or name one with {wanted.flag}'
 
     def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
         """Stamps and images (H, W, 3) BGR, one at a time."""
@@ -145,9 +143,7 @@ class Bag:
         return ((stamp_ns, value) for _, stamp_ns, value in self.read([stream]))
 
     def to_odometry(self, stream: Stream, values: StampedValues) -> Odometry:
-        """Odometry from a stream's values; oddities are noted as problems, and faulty messages are
-        counted as skipped. Raises BagError for two publishers.
-        """
+        """Odometry of values; counts faults. Raises BagError for two publishers."""
         try:
             odometry, oddities, faults = motion.to_odometry(values, stream.topic)
         except DataError as error:
@@ -173,7 +169,7 @@ class Bag:
             stream.images = ImageReader(_short([self.topics[topic].kind]))
         return stream
 
-    def read(self, streams: Iterable[Stream]) -> Iterator[tuple[Stream, int, Any]]:
+    def read(self, streams: Iterable[Stream]) -> Iterator[Used]:
         """Read the streams' topics in one pass: stream, stamp in ns, value.
 
         Raises BagError when a topic has no usable message, or in strict reading on any loss.
@@ -185,13 +181,11 @@ class Bag:
             receive_ns = record[1]
             for stream in by_topic[record[0].name]:
                 stream.received += 1
-                for item in stream.values(self._parts(stream, *record), receive_ns):
-                    yield from _used(stream, stream.push(item))
+                yield from stream.take(self._parts(stream, *record), receive_ns)
         for stream in itertools.chain(*by_topic.values()):
-            delayed = stream.images.finish() if stream.images else []
-            for item in stream.values(delayed, receive_ns):
-                yield from _used(stream, stream.push(item))
-            yield from _used(stream, stream.flush())
+            if stream.images:
+                yield from stream.take(stream.images.finish(), receive_ns)
+            yield from stream.flush()
             self._check_complete(stream)
 
     def _parts(
@@ -247,12 +241,6 @@ class Bag:
     def _raise_problems(self) -> None:
         if self.strict and self.problems:
             raise BagError(f'{self.path}: {self.problems[0]}; read without --strict to salvage it')
-
-
-def _used(stream: Stream, items: Iterable[Item]) -> Iterator[tuple[Stream, int, Any]]:
-    for item in items:
-        stream.used += 1
-        yield stream, item.stamp_ns, item.value
 
 
 def _short(kinds: Iterable[str], between: str = '') -> str:

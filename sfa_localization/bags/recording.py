@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Collection, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -30,10 +30,9 @@ from sfa_localization.bags.files import (
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.files import first_bytes, read_regular
 from sfa_localization.data.plain_yaml import LONGEST, load_yaml
-from sfa_localization.data.rejections import short_line
+from sfa_localization.data.rejections import listed, short_line
 
 METADATA = 'metadata.yaml'
-_LISTED = 8  # bags of an error message
 SUFFIXES = ('.db3', '.mcap', '.bag', '.db3.zstd', '.mcap.zstd')
 
 
@@ -49,16 +48,6 @@ def recorded_files(path: Path) -> list[Path]:
 def _bag_files(folder: Path) -> list[str]:
     """Names of the files of a folder with suffixes of bags. Raises OSError."""
     return sorted(name for name in os.listdir(folder) if name.endswith(SUFFIXES))
-
-
-def _bags_in(folder: Path) -> list[str]:
-    """Names of the bags that are folders in a folder."""
-    names = []
-    for name in sorted(os.listdir(folder)):
-        with suppress(OSError):  # of files, and of folders that may not be read
-            if _bag_files(folder / name) or (folder / name / METADATA).is_file():
-                names.append(name)
-    return names
 
 
 class Recording:
@@ -124,9 +113,12 @@ class Recording:
             self.problems.append(f'{METADATA} is damaged ({error}); rebuilt from the files, as '
                                  '`ros2 bag reindex` does for good')  # fmt: skip
         if not files:
-            if inside := _bags_in(self.path):
-                listed = ', '.join([*inside[:_LISTED], *['...'] * (len(inside) > _LISTED)])
-                raise BagError(f'{self.path}: is no bag; it holds the bags {listed}: name them')
+            suffixes = (*SUFFIXES, METADATA)
+            files_inside = (file for file in self.path.glob('*/*') if file.name.endswith(suffixes))
+            inside = {file.parent.name for file in files_inside}
+            if inside:
+                bags = listed(sorted(inside))
+                raise BagError(f'{self.path}: is no bag; it holds the bags {bags}: name them')
             raise BagError(f'{self.path}: no bag: neither {METADATA} nor .db3, .mcap, .bag')
         return files, []
 

@@ -19,9 +19,7 @@ status GBAS for corrections of a base station, both for 0.02 m and for the 0.3 m
 
 
 def fix_of(message: Any) -> tuple[float, float, float]:
-    """Latitude and longitude, degrees, of a NavSatFix, and the standard deviation, m. Raises
-    MessageError where there is no fix.
-    """
+    """Latitude and longitude, degrees, and std, m, of a NavSatFix. Raises MessageError."""
     if message.status.status < 0:
         raise MessageError('the receiver has no fix')
     latitude, longitude = float(message.latitude), float(message.longitude)

@@ -16,9 +16,7 @@ TOPIC = '/tf_static'
 
 
 def lever_arm(bag: Bag, sensor_topic: str, odometry_topic: str) -> complex | None:
-    """Position of a sensor, ahead + i left, m, in the child frame of the odometry; None where
-    static transforms do not connect both frames.
-    """
+    """Place of a sensor, ahead + i left, m, from the odometry's child frame; None if unknown."""
     topic = bag.topics.get(TOPIC)
     if topic is None or not decoding.can_decode(topic):
         return None

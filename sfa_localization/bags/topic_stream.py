@@ -35,9 +35,7 @@ class Item(NamedTuple):
         return abs(self.late_ns(before)) <= CLOCK_JUMP_NS
 
     def corrects(self, ahead: Item, before: Item | None) -> bool:
-        """Whether this stamp is more plausible than the later stamp of the previous message,
-        `ahead`.
-        """
+        """Whether this stamp is more plausible than the later one of the previous message."""
         if before is None or self.stamp_ns == ahead.stamp_ns:
             return self.stamp_ns < ahead.stamp_ns
         later = self.stamp_ns > before.stamp_ns
@@ -78,9 +76,7 @@ class Stream:
 
     @property
     def ahead_ns(self) -> tuple[float, float]:
-        """By how much stamps are ahead of the reception, by the median of the messages used, and
-        the range of the middle 80 % of them.
-        """
+        """Median of how far stamps are ahead of the reception, and range of the middle 80 %."""
         low, middle, high = np.percentile(self._ahead_ns or [0], (10, 50, 90))
         return float(middle), float(high - low)
 
@@ -91,19 +87,19 @@ class Stream:
                            'read without --strict to skip such messages')  # fmt: skip
         self.skipped.add(reason)
 
-    def values(self, parts: Iterable[tuple[int, Any]], receive_ns: int) -> Iterator[Item]:
-        """The values of messages or images; faulty ones are counted."""
+    def take(self, parts: Iterable[tuple[int, Any]], receive_ns: int) -> Iterator[Used]:
+        """Use the values of messages or images with their stamps; faulty ones are counted."""
         for stamp_ns, part in parts:
             try:
                 if isinstance(part, LocalizationError):
                     raise part
-                yield Item(stamp_ns, receive_ns, part if self.opaque else self.convert(part))
-            except BagError:
-                raise
+                item = Item(stamp_ns, receive_ns, part if self.opaque else self.convert(part))
             except LocalizationError as error:
                 self.skip(str(error))
+            else:
+                yield from self.push(item)
 
-    def push(self, item: Item) -> list[Item]:
+    def push(self, item: Item) -> list[Used]:
         """The message to be used now, if any; the latest is held back until `flush`."""
         waiting, last = self._waiting, self._last
         before = waiting or last
@@ -121,12 +117,12 @@ class Stream:
             self.skip('duplicate stamp' if same else other)
         return []
 
-    def flush(self) -> list[Item]:
+    def flush(self) -> list[Used]:
         """The message held back."""
         waiting, self._waiting = self._waiting, None
         return self._settled(waiting, None)
 
-    def _settled(self, waiting: Item | None, following: Item | None) -> list[Item]:
+    def _settled(self, waiting: Item | None, following: Item | None) -> list[Used]:
         """The message held back, if it continues the last one or is continued by the following."""
         if waiting is None:
             return []
@@ -136,7 +132,12 @@ class Stream:
             return []
         self._last = waiting
         self._ahead_ns.append(waiting.stamp_ns - waiting.receive_ns)
-        return [waiting]
+        self.used += 1
+        return [(self, waiting.stamp_ns, waiting.value)]
+
+
+Used = tuple[Stream, int, Any]
+"""A stream, with the stamp, ns, and the value of a message."""
 
 
 def clock_offset(name: str, stream: Stream, odometry: Stream) -> tuple[int, str]:

@@ -50,13 +50,14 @@ def _rotated(panorama: Image, turn: Array, sphere: Sphere) -> Image:
 class LeveledPanoramas:
     """Panoramas leveled by their `tilts` (N, 2), roll and pitch rad."""
 
+    stamps_ns: Stamps
     panoramas: Panoramas
     tilts: Array
     sphere: Sphere
 
-    @property
-    def stamps_ns(self) -> Stamps:
-        return self.panoramas.stamps_ns
+    @classmethod
+    def of(cls, panoramas: Panoramas, tilts: Array, sphere: Sphere) -> LeveledPanoramas:
+        return cls(panoramas.stamps_ns, panoramas, tilts, sphere)
 
     @property
     def shape(self) -> tuple[int, int, int]:

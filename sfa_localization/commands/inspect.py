@@ -42,9 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Inspect all bags, each alone and all together; an unreadable bag is reported, and the others
-    are still inspected.
-    """
+    """Inspect all bags, each alone, also after an unreadable one, and all together."""
     topics = options.settings(TopicNames, arguments)
     config = options.settings(InspectionConfig, arguments)
     clockwise = options.settings(PanoramaConfig, arguments).clockwise

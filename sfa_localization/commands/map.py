@@ -17,8 +17,7 @@ WRITES = 'MAP.yaml and MAP.pgm, which nav2_map_server reads'
 EXAMPLES = """\
   map garden.npz --output garden.yaml
   map garden.npz --output garden.yaml --width 0.6"""
-_FREE, _UNKNOWN = 254, 205  # gray levels of map_saver
-# A cell of the second level is occupied by 50 / 255 = 0.19608, which is not free.
+_FREE, _UNKNOWN = 254, 205  # gray levels of map_saver: the second is occupied by 0.19608
 _YAML = """\
 image: {image}
 mode: trinary

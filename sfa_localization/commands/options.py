@@ -33,9 +33,7 @@ REPORT_FILES = ('.html', '.md', '.png')
 
 
 def require_output(output: Path, inputs: Iterable[Path | None], *suffixes: str) -> None:
-    """Raise LocalizationError if an output would replace an input or a file of an input bag, or if
-    it is a file without one of the suffixes.
-    """
+    """Raise LocalizationError if an output replaces an input or a file of another suffix."""
     from sfa_localization.bags.recording import recorded_files
 
     require_outputs([output], [file for path in inputs if path for file in recorded_files(path)])
@@ -43,9 +41,7 @@ def require_output(output: Path, inputs: Iterable[Path | None], *suffixes: str) 
 
 
 def require_kind(output: Path, *suffixes: str) -> None:
-    """Raise LocalizationError if an output, or the target of a link, is a file without one of the
-    suffixes.
-    """
+    """Raise LocalizationError if an output, or what it links to, is a file of another suffix."""
     replaced = resolved(output)
     if first_bytes(replaced) and replaced.suffix.lower() not in suffixes:
         kinds = ' or '.join(suffixes)
@@ -60,9 +56,7 @@ def require_new(output: Path) -> None:
 
 
 def require_report(folder: Path | None, other: Path | None) -> None:
-    """Raise LocalizationError if a report cannot have its folder, or would replace the other output
-    or files of the user.
-    """
+    """Raise LocalizationError if a report has no folder, or replaces files of the user."""
     if folder is None:
         return
     from sfa_localization.reports.page import MARK, PAGE

@@ -66,9 +66,7 @@ class ErrorCorrelation:
         return cls(*_exponential(distance, correlation, count[filled].astype(float)))
 
     def alike(self, driven_m: Array) -> Array:
-        """The sum (M,) of the correlations of each error with all, for images at `driven_m` (M,):
-        so many errors weigh as much as a single one.
-        """
+        """Sums (M,) of the correlations of each error with all, of images at `driven_m` (M,)."""
         order = np.argsort(driven_m, kind='stable')
         path, total = driven_m[order], np.ones(len(driven_m))
         for lag in range(1, len(path)):

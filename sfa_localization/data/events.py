@@ -23,9 +23,7 @@ LEAP_SECONDS = {18: 'GPS time', 19: 'TAI', 37: 'TAI'}
 
 
 def whole_leap(offset_ns: float) -> int:
-    """The offset of two clocks, ns, that reception shows to a fraction of a second: without the
-    fraction where it is one of LEAP_SECONDS.
-    """
+    """An offset of clocks, ns, without its fraction of a second if it is one of LEAP_SECONDS."""
     seconds = round(offset_ns * 1e-9)
     return seconds * 1_000_000_000 if abs(seconds) in LEAP_SECONDS else round(offset_ns)
 

@@ -112,19 +112,8 @@ def replaced_mode(path: Path) -> int:
     return stat.S_IMODE(status.st_mode)
 
 
-def _require_folder(path: Path) -> None:
-    """Raise OSError for a folder in which no file, or which itself, can be made."""
-    nearest = next(each for each in (path, *path.parents) if each.exists())
-    if not nearest.is_dir():
-        raise OSError(f'{nearest} is no folder')
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise OSError(f'no permission to write in {nearest}')
-
-
 def require_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
-    """Raise LocalizationError before the work where atomic_write could not write its results, or
-    where they would replace each other or an input.
-    """
+    """Raise LocalizationError if an output cannot be written, or replaces another or an input."""
     targets: set[Path] = set()
     for path in outputs:
         if resolved(path) in targets:
@@ -132,7 +121,11 @@ def require_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> N
         targets.add(resolved(path))
         try:
             replaced_mode(path)
-            _require_folder(resolved(path).parent)
+            nearest = next(each for each in resolved(path).parents if each.exists())
+            if not nearest.is_dir():
+                raise OSError(f'{nearest} is no folder')
+            if not os.access(nearest, os.W_OK | os.X_OK):
+                raise OSError(f'no permission to write in {nearest}')
         except OSError as reason:
             why = reason.strerror or reason
             raise LocalizationError(f'{path}: cannot be written: {why}') from None

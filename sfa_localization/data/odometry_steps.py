@@ -67,14 +67,12 @@ def tolerance(seconds: ArrayLike, noise: float) -> Array:
 
 
 def learned(noise: float, distance: float) -> float:
-    """The standard deviation of steps after another one at this distance `beyond` the speed: their
-    running 68 % quantile.
-    """
+    """The running 68 % quantile, `noise`, after another step at a distance `beyond` the speed."""
     return max(noise * math.exp(_LEARNING * (0.68 - (distance <= noise))), _NOISE_LEAST)
 
 
 class _Message(NamedTuple):
-    """A message that ends a path: its number among all, seconds, pose, v m/s and omega rad/s."""
+    """A message: its number, and that of the first on its path; v m/s and omega rad/s."""
 
     path: int
     number: int
@@ -91,7 +89,7 @@ class Paths:
 
     def __init__(self, noise: float = NOISE_START) -> None:
         self._ends: list[_Message] = []  # of the paths; that of the last message comes last
-        self._messages, self._paths, self._returned = 0, 0, -1
+        self._messages, self._returned = 0, -1
         self.noise, self._share = noise, 0.0
         self.aside = 0
         """Number of messages that the last one shows to be beside its path."""
@@ -104,48 +102,39 @@ class Paths:
     def add(self, seconds: float, pose: Sequence[float], v: float, omega: float) -> int:
         """Take a message with a pose x m, y m, yaw rad; returns the number of its path."""
         ends = [end for end in self._ends if seconds - end.seconds < RETURN_S]
-        message = _Message(self._paths, self._messages, seconds, pose, (v, omega))
-        best, least = None, math.inf
+        message = _Message(self._messages, self._messages, seconds, pose, (v, omega))
+        self._messages, self.aside = self._messages + 1, 0
         for end in reversed(ends):
             distance = _distance(end, message)
-            excess = distance - float(tolerance(seconds - end.seconds, self.noise))
-            if excess < least and least > 0:
-                best, least, nearest = end, excess, distance
-        if best is not None:
-            self.noise = learned(self.noise, nearest)
-        self._paths += least > 0
-        self.aside = 0
-        if best is not None and least <= 0:
-            message = message._replace(path=best.path)
-            self._continued(best, message, best is ends[-1])
-        self._messages += 1
-        others = [end for end in ends if end.path != message.path]
-        self._ends = [*others[-2:], message]
+            if distance <= tolerance(seconds - end.seconds, self.noise):
+                self.noise = learned(self.noise, distance)
+                message = message._replace(path=end.path)
+                if end.pose != message.pose:
+                    self._continued(end, message.number - end.number - 1)
+                break
+        self._ends = [*[end for end in ends if end.path != message.path][-2:], message]
         return message.path
 
-    def _continued(self, end: _Message, message: _Message, is_last: bool) -> None:
-        """Take into account that a message continues a path, perhaps after others."""
-        if end.pose == message.pose:
-            return
-        changed = not is_last and self._returned != end.path
+    def _continued(self, end: _Message, others: int) -> None:
+        """Take into account that a path goes on, after messages of others."""
+        changed = others > 0 and self._returned != end.path
         self._share += (changed - self._share) / _MEMORY
-        if not is_last:
+        if others:
             self._returned = end.path
-            self.aside = 0 if self.in_turn else message.number - end.number - 1
+            self.aside = 0 if self.in_turn else others
 
 
 def _distance(end: _Message, message: _Message) -> float:
-    """How far a message, m or rad, is from where the speeds lead from the end of a path."""
-    seconds = message.seconds - end.seconds
+    """How far a message, m or rad, is `beyond` the speeds from the end of a path."""
     dx, dy, turn = (b - a for a, b in zip(end.pose, message.pose, strict=True))
     c, s, turn = math.cos(end.pose[2]), math.sin(end.pose[2]), math.remainder(turn, math.tau)
-    way, twists = (dx * c + dy * s, dy * c - dx * s), (end.twist, message.twist)
-    near = min(max(math.dist(way, (v * seconds, 0.0)), abs(turn - w * seconds)) for v, w in twists)
-    if near < JUMP:
-        return near
-    longest_s = seconds + _STALE_S
-    moved = beyond(way, longest_s, [(v, 0.0) for v, _ in twists])
-    return max(float(moved), float(beyond([turn], longest_s, [(w,) for _, w in twists])))
+    longest_s, twists = message.seconds - end.seconds + _STALE_S, (end.twist, message.twist)
+
+    def missed(step: float, speed: float) -> float:
+        return step - sorted((0.0, step, speed * longest_s))[1]
+
+    moved = min(math.hypot(missed(dx * c + dy * s, v), dy * c - dx * s) for v, _ in twists)
+    return max(moved, min(abs(missed(turn, omega)) for _, omega in twists))
 
 
 def beside(seconds: Array, poses: Array, twists: Array) -> tuple[Mask, float]:
@@ -154,16 +143,16 @@ def beside(seconds: Array, poses: Array, twists: Array) -> tuple[Mask, float]:
 
     `seconds` (N,) increase; `poses` (N, 3) are x m, y m, yaw rad, `twists` (N, 2) m/s and rad/s.
     """
-    aside, noise, in_turn = np.zeros(len(poses), bool), NOISE_START, 0
+    aside, path, noise = np.zeros(len(poses), bool), np.zeros(len(poses), np.int64), NOISE_START
+    if not len(poses):
+        return aside, 0.0
     for _ in range(2):  # the first time shows the noise
-        paths, number, in_turn = Paths(noise), [], 0
-        for row in zip(seconds.tolist(), poses.tolist(), *twists.T.tolist(), strict=True):
-            number.append(paths.add(*row))
+        paths, in_turn = Paths(noise), 0
+        messages = zip(seconds.tolist(), poses.tolist(), *twists.T.tolist(), strict=True)
+        for k, message in enumerate(messages):
+            path[k] = paths.add(*message)
             in_turn += paths.in_turn
         noise = paths.noise
-        if len({*number}) < 2:
-            return aside, 0.0
-    path = np.array(number, np.int64)
     order = np.argsort(path, kind='stable')
     of_path = np.split(order, np.flatnonzero(np.diff(path[order])) + 1)
     lengths = [float(np.hypot(*np.diff(poses[rows, :2], axis=0).T).sum()) for rows in of_path]

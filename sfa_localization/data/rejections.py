@@ -40,3 +40,8 @@ def encodable(text: str) -> str:
 def quoted(value: object) -> str:
     """The repr of any value, in one line of bounded length."""
     return short_line(repr(value))
+
+
+def listed(names: list[str], most: int = 8) -> str:
+    """Names for an error message."""
+    return ', '.join(names[:most] + ['...'] * (len(names) > most))

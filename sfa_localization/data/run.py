@@ -153,7 +153,7 @@ class Count:
 
 class Panoramas(Protocol):
     """The images of a run, read from disk in batches: stamps (N,), and the shape (H, W, C) of each,
-    BGR uint8.
+    BGR uint8. Those of a Run are dataclasses.
     """
 
     @property
@@ -203,27 +203,6 @@ class PanoramaArray:
 
 
 @dataclass(frozen=True, slots=True)
-class StampedPanoramas:
-    """Panoramas with other stamps (N,)."""
-
-    stamps_ns: Stamps
-    panoramas: Panoramas
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        return self.panoramas.shape
-
-    def __len__(self) -> int:
-        return len(self.panoramas)
-
-    def read(self, start: int, stop: int) -> Image:
-        return self.panoramas.read(start, stop)
-
-    def batches(self, size: int) -> Iterator[Image]:
-        return self.panoramas.batches(size)
-
-
-@dataclass(frozen=True, slots=True)
 class Run:
     """One drive: images, odometry, measured points and, for evaluation only, the ground truth.
 
@@ -245,17 +224,10 @@ class Run:
 
 def integrate(stamps_ns: Stamps, twists: Array, start: Array | None = None) -> Array:
     """Dead reckoning: poses (N, 3) from twists (N, 2), each constant since the previous stamp."""
-    poses = np.zeros((len(stamps_ns), 3))
-    poses[0] = 0.0 if start is None else start
-    dt = np.diff(stamps_ns) * 1e-9
-    v, omega = twists[1:].T
-    yaw = poses[0, 2] + np.concatenate([[0.0], np.cumsum(omega * dt)])
-    chord = v * dt * np.sinc(omega * dt / 2 / np.pi)
-    middle = (yaw[:-1] + yaw[1:]) / 2
-    poses[1:, 0] = poses[0, 0] + np.cumsum(chord * np.cos(middle))
-    poses[1:, 1] = poses[0, 1] + np.cumsum(chord * np.sin(middle))
-    poses[:, 2] = wrap_angle(yaw)
-    return poses
+    way, turn = twists[1:].T * np.diff(stamps_ns) * 1e-9
+    chord = way * np.sinc(turn / 2 / np.pi)
+    steps = np.column_stack([chord * np.cos(turn / 2), chord * np.sin(turn / 2), turn])
+    return chained(np.zeros(3) if start is None else start, steps)
 
 
 def chained(start: Array, steps: Array) -> Array:

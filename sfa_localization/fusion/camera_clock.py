@@ -200,9 +200,7 @@ class ImageClock:
     def add_heading(
         self, stamp_ns: int, yaw_rad: float, odometry_ns: int
     ) -> CameraClockFinder | None:
-        """Take the heading at an image's stamp, and the stamp of the last odometry; return what
-        follows the delay of the images from now on if another offset is confirmed.
-        """
+        """Take the heading at an image's stamp; return the new finder if an offset is confirmed."""
         self._ahead_ns.append(stamp_ns - odometry_ns)
         ahead_ns = np.array(self._ahead_ns) - self.offset_ns
         if len(ahead_ns) < _ARRIVALS or np.ptp(ahead_ns) > _IN_TRANSIT_NS:

@@ -290,9 +290,7 @@ def with_delay(belief: Belief, late: Quantity) -> Belief:
 
 
 def _fix(belief: Belief, event: MeasurementEvent) -> PositionFix:
-    """A measurement beside the pose by dead reckoning, not accepted yet; the uncertain delay adds
-    to its variances.
-    """
+    """A measurement beside the pose by dead reckoning; the uncertain delay adds variance."""
     moving = motion.velocity(belief.mean)[: len(event.value)]
     variances = event.covariance.diagonal() + moving**2 * belief.covariance[DELAY, DELAY]
     x, y, *yaw = event.value.tolist()

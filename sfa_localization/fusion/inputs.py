@@ -118,9 +118,7 @@ def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
 
 
 def _positive(matrix: Array) -> Array:
-    """The symmetric part of a covariance. Raises DataError unless it is positive, and symmetric but
-    for rounding.
-    """
+    """Symmetric part of a covariance. Raises DataError unless symmetric and positive definite."""
     try:
         if np.abs(matrix - matrix.T).max() <= _SKEW * matrix.max():
             np.linalg.cholesky(symmetric(matrix))

@@ -135,8 +135,8 @@ class Twist(NamedTuple):
 
 
 class Pace(NamedTuple):
-    """How this robot changes its speed and turn rate: mean squares `v` and `omega`, over `seconds`
-    of driving, of the changes within a second; `last` is the twist from which the next counts.
+    """Mean squares `v` and `omega` of this robot's changes of speed and turn rate in a second, over
+    `seconds` of driving; `last` is the twist from which the next change counts.
     """
 
     stamp_ns: int = 0
@@ -241,9 +241,7 @@ def coast(mean: Array, twist: Twist, dt: float, noise: MotionNoise, changes: Arr
 
 
 def halt(mean: Array, twist: Twist, dt: float, noise: MotionNoise, changes: Array) -> Step:
-    """Expect no motion, and allow for any: odometry has been silent for too long. The robot may go
-    on by the last reading `twist`, or by what `changes` (2,) of speed and turn rate have led to.
-    """
+    """Expect no motion, but allow for the last `twist`, or for what `changes` (2,) have led to."""
     step = _stand(mean)
     speed, rate = np.maximum(np.square(twist[:2]), changes).tolist()
     step.noise[[X, Y, V], [X, Y, V]] += speed * np.array([2 * dt, 2 * dt, 1.0])

@@ -40,9 +40,7 @@ def repeats(belief: Belief, event: OdometryEvent) -> bool:
 
 
 def _moves(belief: Belief, event: OdometryEvent) -> bool:
-    """Whether the robot moves by the twist of a message, or, where messages fill none, by that of
-    the poses before it.
-    """
+    """Whether the robot moves by a message's twist, or by the poses before if none is filled."""
     filled = belief.odometry.fills_twist or event.twist.v or event.twist.omega
     return (event.twist if filled else belief.twist).moves
 
@@ -81,9 +79,7 @@ def jump(belief: Belief, event: OdometryEvent) -> Jump | None:
 
 
 def interval(belief: Belief, event: OdometryEvent) -> tuple[Twist, Twist] | None:
-    """The mean twist from the belief to an odometry message, and the twist from then on; None after
-    a silence without poses.
-    """
+    """Mean twist up to a message, and the twist from then on; None after silence without poses."""
     seconds, reading = silence_s(belief, event), event.twist
     mean = _mean_twist(belief, event, seconds)
     if belief.odometry.stamp_ns is not None and seconds > ODOMETRY_TIMEOUT_S:
@@ -100,9 +96,7 @@ def interval(belief: Belief, event: OdometryEvent) -> tuple[Twist, Twist] | None
 
 
 def _mean_twist(belief: Belief, event: OdometryEvent, seconds: float) -> Twist | None:
-    """The mean twist since the last message by the odometry's poses; None where they do not show
-    it.
-    """
+    """The mean twist since the last message by the poses; None where they do not show it."""
     before, after = belief.odometry.pose, event.pose
     if before is None or after is None or before == after or not 0 < seconds <= _LONGEST_S:
         return None

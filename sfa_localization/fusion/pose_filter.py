@@ -244,9 +244,7 @@ class PoseFilter:
         self._camera.add_heading(int(stamp_ns) - self._images.offset_ns, yaw_rad)
 
     def expect(self, rig: Rig) -> None:
-        """Take the rig of the training as prior. Estimates since the start stay; the camera delay
-        by turns since the start takes precedence.
-        """
+        """Take a rig as prior; estimates since the start stay, as a delay shown by turns."""
         self._rig, self._ekf = rig, Ekf(self.config, self.correlation, rig)
         self.scale = rig.wheel_scale.value * self.config.odometry_scale
         delay_s = rig.camera_delay.value
@@ -295,9 +293,7 @@ class PoseFilter:
 
     @property
     def nis(self) -> float:
-        """Normalized innovation squared over its expectation, of all measurements inside the gate:
-        1 where covariances are right; NaN before any.
-        """
+        """Mean normalized innovation squared inside the gate, over its expectation: 1 is right."""
         total, count = self._nis
         return total / count if count else math.nan
 
@@ -317,9 +313,7 @@ class PoseFilter:
         return self._at(stamp_ns)
 
     def _at(self, stamp_ns: int) -> State | None:
-        """If odometry repeats commands, the robot is where the odometry was one delay ago, and
-        images are in time.
-        """
+        """If odometry repeats commands, the robot is where it was one delay ago."""
         robot_ns, delay_ns = stamp_ns, self._camera.clock.delay_ns if self._open_loop.repeats else 0
         if 0 < abs(delay_ns) <= DELAY_LIMIT_NS and self._history.reaches(stamp_ns - delay_ns):
             robot_ns -= delay_ns

@@ -87,9 +87,7 @@ def relocate(fixes: Sequence[PositionFix], decorrelation_m: float) -> Relocation
 
 
 def _turns(fixes: Columns) -> list[tuple[float, float]]:
-    """Turns from dead reckoning to the map, with their variances: by the newest image's heading,
-    and by its pairs with others.
-    """
+    """Turns from dead reckoning to the map, and variances: by headings and by pairs of images."""
     turns = []
     if fixes.has_yaw[-1]:
         turn = float(wrap_angle(fixes.yaw[-1] - fixes.path_yaw[-1]))

@@ -52,7 +52,7 @@ def leveled_runs(
             tilts[rows] = pairs.tilts(tilts[rows])
             of_runs = np.split(np.column_stack([tilts.real, tilts.imag]), np.cumsum(counts)[:-1])
             level = tuple(
-                replace(run, panoramas=LeveledPanoramas(run.panoramas, tilt, sphere))
+                replace(run, panoramas=LeveledPanoramas.of(run.panoramas, tilt, sphere))
                 for run, tilt in zip(runs, of_runs, strict=True)
             )
     return level

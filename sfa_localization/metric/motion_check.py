@@ -21,7 +21,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array, Complex, Indices, relative, wrap_angle
 from sfa_localization.data.odometry_steps import JUMP, NOISE
-from sfa_localization.data.run import Odometry, Run, StampedPanoramas, Stamps, YawRate
+from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
 from sfa_localization.metric.breaks import StampedTextures, contradicted, parted
 from sfa_localization.metric.motion_clocks import Drift, drift_sentences, drifts, following
@@ -144,7 +144,8 @@ def check_drives(
         checks.append(check)
         if check.image_drift:
             stamps_ns = stamps_ns - check.image_drift.late_ns(stamps_ns)
-            run = replace(run, panoramas=StampedPanoramas(stamps_ns, run.panoramas))
+            panoramas = replace(run.panoramas, stamps_ns=stamps_ns)  # type: ignore[type-var]
+            run = replace(run, panoramas=panoramas)
         corrected.append(replace(run, odometry=check.odometry, yaw_rate=check.gyro))
     return tuple(corrected), tuple(checks)
 

@@ -39,7 +39,6 @@ _FIXED = np.diag([1e-6] * 6)
 """Covariance of z, roll and pitch, which a planar estimate fixes."""
 _PLANAR, _TWIST = np.ix_([0, 1, 5], [0, 1, 5]), np.ix_([0, 5], [0, 5])
 _CORRELATION = 'error_correlation'
-_FREE, _UNKNOWN = 0, -1
 _RED_M, _LINE_M = 0.3, 0.05
 """The expected error that is drawn red, and the width of the lines."""
 
@@ -179,7 +178,7 @@ def to_grid(cells: Cells, stamp_ns: int, frame: str) -> OccupancyGrid:
     info = MapMetaData(map_load_time=to_stamp(stamp_ns), resolution=cells.size_m)
     info.height, info.width = cells.driven.shape
     info.origin.position.x, info.origin.position.y = cells.corner.tolist()
-    values = np.where(cells.driven, _FREE, _UNKNOWN).astype(np.int8)
+    values = np.where(cells.driven, 0, -1).astype(np.int8)
     data = array.array('b', values.tobytes())
     return OccupancyGrid(header=_header(stamp_ns, frame), info=info, data=data)
 

@@ -37,8 +37,7 @@ class Discovery:
         self._node, self._topic, self._arguments, self._types = node, topic, arguments, types
         self._start_s = steady_s()
         self._expected = node.resolve_topic_name(topic)
-        remapped = self._expected != node.resolve_topic_name(topic, only_expand=True)
-        self._take = None if remapped else take
+        self._take = None if node.is_remapped(topic) else take
         self._has_substitute = False
         self.hint = ''
         """Which topics there are, while nobody publishes on that of the input."""
@@ -62,7 +61,9 @@ class Discovery:
             (name, kind)
             for kind in self._types
             for name, kinds in sorted(self._node.get_topic_names_and_types())
-            if kind in kinds and self._publishers(name) - this_node and self._is_offered(name)
+            if kind in kinds and self._publishers(name) - this_node
+            # Panoramas are an input where an argument of the launch file takes them.
+            if 'panorama' in self._arguments or not self._is_output(name)
         ]
         usable = [n for n, kind in topics if kind == self._types[0] and self._qualifies(n)]
         if self._take is not None and len(usable) == 1:
@@ -88,10 +89,6 @@ class Discovery:
         others = tuple(space for space in spaces if len(space) > len(below))
         usual = name.startswith(below) and not name.startswith(others)
         return usual and not self._is_output(name)
-
-    def _is_offered(self, name: str) -> bool:
-        """Whether an argument of the launch file takes a topic: panoramas are also an input."""
-        return 'panorama' in self._arguments or not self._is_output(name)
 
     def _is_output(self, name: str) -> bool:
         ours = {node for node, _ in self._publishers(name)} & {*NODES, self._node.get_name()}

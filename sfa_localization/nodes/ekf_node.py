@@ -106,8 +106,7 @@ class EkfNode(LocalizationNode):
         # The services of nav2_amcl, by its names.
         self.order(Empty, 'reinitialize_global_localization', self._forget_pose)
         if SetInitialPose is not None:
-            take_pose = self._set_pose
-            self.order(SetInitialPose, 'set_initial_pose', lambda given: take_pose(given.pose))
+            self.order(SetInitialPose, 'set_initial_pose', lambda it: self._set_pose(it.pose))
         self.every(_WATCH_PERIOD_S, self._publish_state)
         self.every(SAVE_PERIOD_S, self._save_pose)
         # A bag played in a loop steps simulated time back, before the stamps of messages do.

@@ -13,14 +13,8 @@ from sfa_localization.data.errors import CameraError, ConfigError, LocalizationE
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.data.run import Image
 from sfa_localization.nodes.lifecycle import LocalizationNode, sensor_qos
+from sfa_localization.nodes.settings import TRANSPORTS
 
-TYPES = {
-    'raw': 'sensor_msgs/msg/Image',
-    'compressed': 'sensor_msgs/msg/CompressedImage',
-    'ffmpeg': 'ffmpeg_image_transport_msgs/msg/FFMPEGPacket',
-    'foxglove': 'foxglove_msgs/msg/CompressedVideo',
-}
-"""Types of messages by the names that image_transport gives to them."""
 _PACKETS = 30
 """Packets of a video that wait, a second of most: a lost one costs all images until a key frame. Of
 other images only the newest waits, as they may come faster than they are used."""
@@ -41,7 +35,7 @@ class ImageInput:
     ) -> None:
         self._node, self._topic, self._use = node, topic, use
         self._kind = _message_class(transport)
-        self.types = sorted(TYPES.values(), key=lambda kind: kind != TYPES[transport])
+        self.types = sorted(TRANSPORTS.values(), key=lambda kind: kind != TRANSPORTS[transport])
         """Types of image messages, this input's first."""
         self._holds_video = transport in ('ffmpeg', 'foxglove')
         self._subscription: Any = None
@@ -61,27 +55,28 @@ class ImageInput:
         self._subscription = None
 
     def _receive(self, message: Any) -> None:
-        has_header = self._kind.__name__ != 'CompressedVideo'
-        source = message.header if has_header else message
-        stamp_ns = read_stamp(source.stamp if has_header else message.timestamp)
+        is_foxglove = self._kind.__name__ == 'CompressedVideo'
+        source = message if is_foxglove else message.header
+        stamp_ns = read_stamp(source.timestamp if is_foxglove else source.stamp)
+        images = self._reader.add(stamp_ns, message)
+        if self._reader.is_video and not self._holds_video:
+            self._holds_video = True
+            self.stop()
+            self.start(self._substitute)
         problem: LocalizationError | None = None
-        for image_ns, image in self._reader.add(stamp_ns, message):
+        for image_ns, image in images:
             try:
                 if isinstance(image, CameraError):
                     raise image
                 self._use(image_ns, image, source.frame_id)
             except LocalizationError as error:
                 problem = error
-        if self._reader.is_video and not self._holds_video:
-            self._holds_video = True
-            self.stop()
-            self.start(self._substitute)
         if problem is not None:
             raise problem
 
 
 def _message_class(transport: str) -> Any:
-    package, _, name = TYPES[transport].split('/')
+    package, _, name = TRANSPORTS[transport].split('/')
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name)
     except ImportError:

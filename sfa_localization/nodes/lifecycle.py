@@ -39,7 +39,6 @@ _PACKAGE = 'sfa_localization'
 DIAGNOSTICS_PERIOD_S = 1.0
 """Time between messages on /diagnostics: diagnostic_aggregator expects about one a second."""
 _WAKE_PERIOD_S = 0.5  # a signal just before the executor waits does not always wake it
-_QOS_PARAMETERS = QoSOverridingOptions.with_default_policies()
 S = TypeVar('S', bound=Settings)
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -109,8 +108,9 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def publisher(self, kind: Any, topic: str, qos: QoSProfile | int = 10) -> Any:
         """A publisher that is silent until activation. A number is the depth of a reliable one."""
+        overrides = QoSOverridingOptions.with_default_policies()
         publisher = self.create_lifecycle_publisher(
-            kind, topic, qos, qos_overriding_options=_QOS_PARAMETERS
+            kind, topic, qos, qos_overriding_options=overrides
         )
         self._entities[publisher] = self.destroy_lifecycle_publisher
         return publisher
@@ -179,9 +179,12 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         A remap of the whole name comes first.
         """
         base, _, transport = topic.rpartition('/')
-        full, resolved = map(self.resolve_topic_name, (topic, base))
-        plain = [self.resolve_topic_name(name, only_expand=True) for name in (topic, base)]
-        return topic if full != plain[0] or resolved == plain[1] else f'{resolved}/{transport}'
+        if self.is_remapped(topic) or not self.is_remapped(base):
+            return topic
+        return f'{self.resolve_topic_name(base)}/{transport}'
+
+    def is_remapped(self, topic: str) -> bool:
+        return self.resolve_topic_name(topic) != self.resolve_topic_name(topic, only_expand=True)
 
     def service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
         """A service with the fields success and message, which tells why `callback` failed."""
@@ -208,8 +211,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
                 self.refuse(name, 'this node is not active')
             return response
 
-        service = self.create_service(kind, name, answer)
-        self._entities[service] = self.destroy_service
+        self.service(kind, name, answer)
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call at a steady period: simulated time may stop, and wall time may step back."""

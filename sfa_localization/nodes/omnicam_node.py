@@ -136,9 +136,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
     @property
     def _info_topic(self) -> str:
         """The topic beside that of the images, as image_transport names it, unless remapped."""
-        resolved = self.resolve_topic_name(_CAMERA_INFO)
-        if resolved != self.resolve_topic_name(_CAMERA_INFO, only_expand=True):
-            return resolved
+        if self.is_remapped(_CAMERA_INFO):
+            return _CAMERA_INFO
         images = self.full_name(self._input).removesuffix(f'/{self._config.image_transport}')
         return f'{images.rpartition("/")[0]}/{_CAMERA_INFO}'
 

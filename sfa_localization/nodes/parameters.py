@@ -58,9 +58,11 @@ def on_change(
     fields = {item.name: item for kind in current for item in dataclasses.fields(kind)}
 
     def convert(changes: list[Parameter]) -> list[Parameter]:
+        """Without those that change nothing, as read-only ones by `ros2 param load` of a dump."""
         typed = [_typed(fields[c.name], c) if c.name in fields else c for c in changes]
-        # ROS refuses an empty list too.
-        return [c for c in typed if not _repeats_fixed(node, c)] or [node.get_parameter(_CLOCK)]
+        now = {p.name: p.value for p in node.get_parameters([c.name for c in typed])}
+        changed = [c for c in typed if c.value != now[c.name]]
+        return changed or [node.get_parameter(_CLOCK)]  # ROS refuses an empty list
 
     def judge(changes: list[Parameter]) -> SetParametersResult:
         try:
@@ -78,14 +80,6 @@ def on_change(
     node.add_pre_set_parameters_callback(convert)
     node.add_on_set_parameters_callback(judge)
     node.add_post_set_parameters_callback(accept)
-
-
-def _repeats_fixed(node: Node, change: Parameter) -> bool:
-    """Whether a read-only parameter gets the value it has, as by `ros2 param load` of a dump."""
-    if not (node.has_parameter(change.name) and node.describe_parameter(change.name).read_only):
-        return False
-    now = node.get_parameter(change.name)
-    return bool(change.get_parameter_value() == now.get_parameter_value())
 
 
 def _changed(settings: S, changes: Sequence[Parameter]) -> S:

@@ -9,7 +9,14 @@ from dataclasses import dataclass
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.settings import Settings, setting
 
-_TRANSPORTS = 'raw', 'compressed', 'ffmpeg', 'foxglove'
+TRANSPORTS = {
+    'raw': 'sensor_msgs/msg/Image',
+    'compressed': 'sensor_msgs/msg/CompressedImage',
+    'ffmpeg': 'ffmpeg_image_transport_msgs/msg/FFMPEGPacket',
+    'foxglove': 'foxglove_msgs/msg/CompressedVideo',
+}
+"""Types of messages by the names that image_transport gives to them."""
+_TRANSPORTS = tuple(TRANSPORTS)
 
 
 @dataclass(frozen=True, slots=True)

@@ -135,22 +135,15 @@ class SfaNode(LocalizationNode):
 
     def _locate(self, stamp_ns: int, image: Image, _: str) -> None:
         assert self._observer is not None
-        if problem := self._declared_problem(self._observer.model.panorama):
+        model = self._observer.model
+        if problem := self._declared_problem(model.panorama):
             raise MessageError(problem)
-        image = self._mounted(image, self._observer.model)
+        if self._declared is None and model.mount_rpy:  # omnicam_node would have mounted it
+            image = _unwrapper(model.mount_rpy, model.panorama)(image)
         self._last = observation = self._observer.observe(stamp_ns, image)
         self._publish(observation)
         if observation.problem:
             raise MessageError(observation.problem)
-
-    def _mounted(self, image: Image, model: PlaceModel) -> Image:
-        """An image of a camera, resampled as in training; omnicam_node, which declares its
-        panoramas, has done so.
-        """
-        expected = image.shape[:2] == (model.panorama.height, model.panorama.width)
-        if self._declared is not None or not (model.mount_rpy and expected):
-            return image
-        return _unwrapper(model.mount_rpy, model.panorama)(image)
 
     def _publish(self, seen: Observation) -> None:
         """Publish an observation; a pose of an unusable image only with its large covariance."""
