@@ -20,6 +20,7 @@ from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile, surprise
 from sfa_localization.metric.dead_reckoning import GAP_MAX_S, without_pause
 from sfa_localization.metric.motion_samples import OUTLIER, fault_sentence, faulty
 from sfa_localization.metric.motion_sources import (
+    EQUAL,
     GYRO,
     IMAGES,
     POSE,
@@ -52,6 +53,8 @@ def cleaned(
     if not compared:
         return gyro, ''
     (wheels, _), (rates, factor), (views, scale) = compared
+    if not any(1 / EQUAL < abs(factor) / unit < EQUAL for unit in (1.0, 180 / np.pi)):
+        return gyro, ''  # not only single samples are faulty
     beyond = _beyond(wheels, rates.stamps_ns, gyro.omega / factor)
     mask = _guilty(rates.stamps_ns, beyond, views.stamps_ns, *_between(wheels, views, scale))
     kept = YawRate(gyro.stamps_ns[~mask], gyro.omega[~mask], gyro.variance[~mask])
