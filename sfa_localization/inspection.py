@@ -8,7 +8,7 @@ import contextlib
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -169,14 +169,6 @@ class BagReport:
     bodies: list[body.Body] = field(default_factory=list)
 
     @property
-    def length_m(self) -> float:
-        """The way by the unbroken parts of the odometry."""
-        if self.odometry is None:
-            return 0.0
-        steps = np.hypot(*np.diff(self.odometry.poses[:, :2], axis=0).T)
-        return float(steps[np.diff(self.odometry.part) == 0].sum())
-
-    @property
     def places(self) -> Array:
         """Poses (M, 3) of all images with odometry."""
         return np.concatenate([np.zeros((0, 3)), *self.drives])
@@ -191,7 +183,7 @@ class BagReport:
             area = max(map(hull_area, self.drives), default=0.0)
             along = max(map(directions, self.drives), default=0)
             facts['drive'] = (
-                f'{self.length_m:.0f} m by {self.odometry_topic}, '
+                f'{sum(map(path_length, self.drives)):.0f} m by {self.odometry_topic}, '
                 f'{len(self.places)} images over {area:.0f} m2, '
                 f'{spacing(self.places):.2f} m apart, '
                 f'along {along} of {SECTORS} directions'
@@ -297,7 +289,6 @@ class _Survey:
         count = bag.topics[self._image].count if self._image else 0
         self._every, self._tilt_every = max(count // SAMPLES, 1), -(-count // body.IMAGES) or 1
         self._sphere = PanoramaConfig(clockwise=clockwise).sphere
-        self._textures: dict[int, NDArray[np.int8]] = {}
         self._rolls_and_pitches: list[tuple[float, float]] = []
 
     def fill(self) -> None:
@@ -339,11 +330,11 @@ class _Survey:
         # Other images are decoded to detect damage, and not kept.
         return self._bag.stream(name, lambda _: None, required=False)
 
-    def _take(self, image: Image) -> tuple[float, NDArray[np.int8] | None]:
+    def _take(self, image: Image) -> tuple[float, NDArray[np.int8] | None, NDArray[np.int8] | None]:
         """Keep a sample of the images now and then.
 
-        Returns the turn of the camera since the first image, rad, and a small texture of the image,
-        None if it repeats the last one.
+        Returns the turn of the camera since the first image, rad, a small texture of the image,
+        None if it repeats the last one, and now and then one of local contrast, of panoramas.
         """
         samples = self._report.samples
         new = self._frozen.add(image)
@@ -352,12 +343,12 @@ class _Survey:
             scale = min(SAMPLE_SIDE / max(image.shape[:2]), 1.0)
             small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
             samples.append(np.asarray(small, np.uint8))
-        number = self._sizes.total()
-        if number % self._tilt_every == 0 and looks_like_panorama(*image.shape[:2]):
-            self._textures[number] = quantized(texture(image)[None])
+        chosen = self._sizes.total() % self._tilt_every == 0
+        chosen = chosen and looks_like_panorama(*image.shape[:2])
         self._sizes[image.shape[:2]] += 1
         yaw = self._gyro.add(kinds.unrolled(image))
-        return yaw, self._gyro.texture if new else None
+        contrast = quantized(texture(image)[None]) if chosen else None
+        return yaw, self._gyro.texture if new else None, contrast
 
     def _yaw_rate(self, message: Any) -> tuple[float, float]:
         """Yaw rate and its variance from an Imu; roll and pitch are kept if it has them."""
@@ -396,48 +387,41 @@ class _Survey:
             return
         images = self._values.get(self._image, [])
         stamps = np.array([stamp for stamp, _ in images], np.int64)
-        yaw = np.array([yaw for _, (yaw, _) in images], float)
-        new = [(stamp, texture) for stamp, (_, texture) in images if texture is not None]
+        yaw = np.array([yaw for _, (yaw, *_) in images], float)
+        new = [(stamp, small) for stamp, (_, small, _) in images if small is not None]
         views = (np.array([s for s, _ in new]), np.stack([t for _, t in new])) if new else None
-        sampled = self._sampled(driven(odometry, stamps))
         if self._rolls_and_pitches:
             tilt = np.degrees(np.std(self._rolls_and_pitches, 0).mean())
             report.tilt = f'tilts the robot by {tilt:.1f} degrees'
-        else:
-            report.tilt = self._camera_tilt(sampled) if sampled is not None else ''
         turns = (stamps, yaw) if camera is not None and camera.shows_turns else None
         rates = self._values.get(self._imu, [])
         gyro = to_yaw_rate(sorted(rates)) if rates else None
         is_panorama = camera is not None and camera.is_panorama
         commands = OpenLoop.of(odometry.twists).repeats
         report.motion = check_motion(odometry, turns, gyro, is_panorama, views, commands)
-        report.bodies = self._bodies(sampled, stamps)
+        contrasts = {k: c for k, (_, (*_, c)) in enumerate(images) if c is not None}
+        self._see(odometry, stamps, contrasts)
         near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
-        places, broken = odometry.trajectory.at(near), report.motion.odometry
-        part, of_image = (
-            broken.part[np.searchsorted(broken.stamps_ns[1:-1], at, 'right')]
-            for at in (odometry.stamps_ns, near)
-        )
-        report.odometry = replace(odometry, part=part)
-        report.drives = [places[of_image == number] for number in np.unique(of_image)]
+        broken, report.odometry = report.motion.odometry, odometry
+        part = broken.part[np.searchsorted(broken.stamps_ns[1:-1], near, 'right')]
+        report.drives = np.split(odometry.trajectory.at(near), np.flatnonzero(np.diff(part)) + 1)
 
-    def _bodies(self, sampled: Textures | None, stamps: Stamps) -> list[body.Body]:
-        """What hides the view, by images at stamps (N,) that turn with the robot."""
-        motion = self._report.motion
-        pair = motion and motion.pair(POSE, IMAGES)
-        if sampled is None or motion is None or (pair and pair.independent):
-            return []
-        headings = motion.odometry.trajectory.at(stamps[sampled.images])[:, 2]
-        light = channels(sampled.textures.shape[1])[0]
-        return body.bodies(sampled.textures[:, light], headings, self._sphere)
-
-    def _sampled(self, path_m: Array) -> Textures | None:
-        """Textures of images after `path_m` (N,) of driving; None without panoramas of one size."""
-        if len({textures.shape for textures in self._textures.values()}) != 1:
-            return None
-        rows = np.array([number for number in self._textures if number < len(path_m)])
-        textures = np.concatenate([self._textures[number] for number in rows.tolist()])
-        return Textures(textures, rows, np.zeros_like(rows), path_m[rows])
+    def _see(
+        self, odometry: Odometry, stamps: Stamps, contrasts: dict[int, NDArray[np.int8]]
+    ) -> None:
+        """Fill in what hides the view, and the tilt, by the local contrasts of some of the images
+        at stamps (N,), where these are panoramas of one size.
+        """
+        if len({contrast.shape for contrast in contrasts.values()}) != 1:
+            return
+        rows, textures = np.array([*contrasts]), np.concatenate([*contrasts.values()])
+        pair = self._report.motion and self._report.motion.pair(POSE, IMAGES)
+        if not (pair and pair.independent):
+            headings = odometry.trajectory.at(stamps[rows])[:, 2]
+            light = channels(textures.shape[1])[0]
+            self._report.bodies = body.bodies(textures[:, light], headings, self._sphere)
+        images = Textures(textures, rows, np.zeros_like(rows), driven(odometry, stamps)[rows])
+        self._report.tilt = self._report.tilt or self._camera_tilt(images)
 
     def _camera_tilt(self, images: Textures) -> str:
         """How the ground tilts the camera, by pairs of images."""

@@ -9,25 +9,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from sfa_localization.data.geometry import Array, Mask
+from sfa_localization.data.geometry import Array
 from sfa_localization.data.sphere import Sphere
 
 STILL = 0.4
-"""A part that changes by less than this share of what its directions change elsewhere is fixed:
-columns of bodies had 0.00 to 0.35 (textured or plain, with noise), those of the surroundings 0.74
-or more; the lower third of their rows had 0.3 or more, and therefore counts below half of this."""
-LOWER = 1 / 3
-"""A body that hides less than this share of the rows harms little."""
-WHOLE = 0.8
-"""If more rows are hidden, the whole columns are blind."""
+"""A column that changes by less than this share of what others change is fixed: those of bodies had
+0.00 to 0.35 (textured or plain, with noise), those of the surroundings 0.67 or more; the lower
+third of their rows had 0.3 or more, and therefore counts below half of this."""
 IMAGES = 400
 """Images that are compared, from all over a drive."""
+# A body is no wider than this share of the columns.
+_WIDEST = 0.6
 # Headings count alike, in bins of 30 degrees with enough images; of fewer bins, nothing is certain.
 _BINS, _FEWEST_IMAGES, _FEWEST_BINS = 12, 5, 6
-# The columns that tell how much a direction changes are at least so far away: the body is as wide.
-_FAR = 1 / 6
-_FEWEST_COLUMNS = 2
 _MASK = 'draw this part black in an image of the panorama, and set mask_file to it'
 
 
@@ -67,63 +63,38 @@ def bodies(textures: NDArray[np.int8], yaw: Array, sphere: Sphere) -> list[Body]
     """What hides the view all the time, by textures (N, rows, columns) of images from all over a
     drive, taken at headings `yaw` (N,) rad. Each is a column wider on both sides.
     """
-    change = changes(textures, yaw, sphere)
+    change = changes(textures, yaw)
     if change is None:
         return []
     rows, columns = change.shape
-    lowest = change[-max(round(LOWER * rows), 1) :].mean(0) < STILL / 2
-    moving = np.where(change[::-1] < STILL, rows, np.arange(rows)[:, None]).min(0)
-    top = np.where(lowest, rows - np.maximum(moving, round(LOWER * rows)), rows) / rows
     whole = np.maximum(change.mean(0), change[: rows // 2].mean(0)) < STILL
-    top[whole | (top < 1 - WHOLE)] = 0.0
-    parts, degrees = [], 360.0 / columns
-    for first, last in _runs(top < 1.0):
-        hidden = np.arange(first, last) % columns
-        edges = np.degrees(sphere.azimuths(columns)[[hidden[0], hidden[-1]]])
-        start = float((edges[1] if sphere.clockwise else edges[0]) - 1.5 * degrees) % 360.0
-        width = (last - first + 2) * degrees
-        parts.append(Body(start, (start + width) % 360.0, float(np.median(top[hidden]))))
+    hidden = whole | (change[-(rows // 3) :].mean(0) < STILL / 2)
+    hidden |= np.roll(hidden, 1) & np.roll(hidden, -1)
+    begin = int(np.argmin(hidden))  # a visible column
+    ring = np.roll(np.arange(columns), -begin)
+    runs = ndimage.find_objects(ndimage.label(hidden[ring])[0])
+    parts, half = [], 180.0 / columns
+    for inside in (ring[run] for (run,) in runs if run.stop - run.start > 1):
+        edges = np.degrees(sphere.azimuths(columns)[inside[[0, -1]]])
+        start, end = edges[::-1] if sphere.clockwise else edges
+        # From below, up to the first row that moves.
+        moves = np.median(change[::-1, inside], axis=1) >= STILL
+        top = 1.0 - max(int(np.argmax(moves)) / rows, 1 / 3)
+        top = 0.0 if np.median(whole[inside]) else top
+        parts.append(Body((start - 3 * half) % 360.0, (end + 3 * half) % 360.0, top))
     return parts
 
 
-def _runs(hidden: Mask) -> list[tuple[int, int]]:
-    """First and last + 1 of the runs of a ring (columns,) that are wide enough; a single column
-    between two is hidden as well.
+def changes(textures: NDArray[np.int8], yaw: Array) -> Array | None:
+    """The variance in time of each part (rows, columns) of textures (N, rows, columns), over that
+    of the other columns; None where the headings `yaw` (N,) rad of the robot hardly change.
     """
-    hidden = hidden | (np.roll(hidden, 1) & np.roll(hidden, -1))
-    if hidden.all() or not hidden.any():
-        return []
-    begin = int(np.argmin(hidden))  # a visible column
-    ring = np.roll(hidden, -begin).astype(int)
-    edges = np.flatnonzero(np.diff(ring, append=0)) + 1 + begin
-    pairs = edges.reshape(-1, 2).tolist()
-    return [(a, b) for a, b in pairs if b - a >= _FEWEST_COLUMNS]
-
-
-def changes(textures: NDArray[np.int8], yaw: Array, sphere: Sphere) -> Array | None:
-    """How much each part (rows, columns) of textures (N, rows, columns) changes, over how much its
-    directions change in the columns elsewhere, which see them at other headings.
-
-    `yaw` (N,) rad are the headings of the robot. None where it turned too little.
-    """
-    bins = np.floor(yaw % (2 * np.pi) * (_BINS / (2 * np.pi))).astype(int) % _BINS
-    counts = np.bincount(bins, minlength=_BINS)
-    used = counts[bins] >= _FEWEST_IMAGES
+    heading = np.floor(yaw % (2 * np.pi) * (_BINS / (2 * np.pi))).astype(int) % _BINS
+    counts = np.bincount(heading, minlength=_BINS)
     if (counts >= _FEWEST_IMAGES).sum() < _FEWEST_BINS:
         return None
-    weight = 1.0 / counts[bins[used]]
-    images, columns = textures[used].astype(np.float32), textures.shape[2]
-    images = images - np.average(images, axis=0, weights=weight)
-    squares = (images**2).swapaxes(1, 2) * weight[:, None, None]
-    column = np.broadcast_to(np.arange(columns), squares.shape[:2])
-    # The column that shows the same direction at heading 0.
-    turned = np.rint(yaw[used] * (columns / (2 * np.pi))).astype(int)
-    seen = (column - (turned if sphere.clockwise else -turned)[:, None]) % columns
-    change, counted = np.zeros((columns, columns, squares.shape[2])), np.zeros((columns, columns))
-    np.add.at(change, (column, seen), squares)
-    np.add.at(counted, (column, seen), np.broadcast_to(weight[:, None], seen.shape))
-    apart = np.abs((column[:1] - column[:1].T + columns // 2) % columns - columns // 2)
-    far = (apart >= _FAR * columns).astype(float)
-    others = np.tensordot(far, change, 1) / np.maximum(far @ counted, 1e-9)[..., None]
-    expected = (counted[..., None] * others).sum(1)
-    return np.asarray(change.sum(1) / np.maximum(expected, 1e-9)).T
+    weight = np.where(counts >= _FEWEST_IMAGES, 1.0 / np.maximum(counts, 1), 0.0)[heading]
+    images = textures - np.average(textures, axis=0, weights=weight)
+    variance = np.average(images**2, axis=0, weights=weight)
+    usual = np.quantile(variance, _WIDEST, axis=1, keepdims=True)
+    return np.asarray((variance + 1e-9) / (usual + 1e-9))
