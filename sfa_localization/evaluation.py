@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -59,7 +58,6 @@ from sfa_localization.training import Recipe
 
 logger = logging.getLogger(__name__)
 Scores = dict[str, dict[str, Any]]
-_CLOCK_OR_FOLLOWING = re.compile('clock runs|^images follow')
 _TRUTH_TOLERANCE_NS = 500_000_000
 WRONG_M = 1.0
 """Position error from which a filter that says LOCALISED is wrong."""
@@ -262,8 +260,7 @@ def _localized(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) 
     if isinstance(fused, Smoother):
         tracks['smoothed'] = FilterTrack.of(fused.smoothed())
     features = np.array([observation.slow_features for observation in usable])
-    said = [text for text in check.corrected + check.wrong if _CLOCK_OR_FOLLOWING.search(text)]
-    sentences = (*said, *true.sentences)
+    sentences = (*check.timing, *true.sentences)
     return _Localized(run, true, tracks, features, np.array(localised), counts, sentences)
 
 

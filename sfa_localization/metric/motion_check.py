@@ -84,6 +84,8 @@ class MotionCheck:
     corrected: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     image_drift: Drift | None = None
+    timing: list[str] = field(default_factory=list)
+    """Those of the sentences that are about drifting clocks, and images that follow the robot."""
 
     def pair(self, a: str, b: str, what: str = 'turns') -> Pair | None:
         """The comparison of b with a."""
@@ -269,7 +271,8 @@ def _repaired(
         check.odometry, text = change(check.odometry)
         check.corrected += [text] if text else []
     drifting = drifts(sources_of(check.odometry, images, check.gyro))
-    check.corrected += drift_sentences(drifting)
+    check.timing += drift_sentences(drifting)
+    check.corrected += check.timing
     if check.gyro is not None and GYRO in drifting:
         stamps_ns = check.gyro.stamps_ns
         stamps_ns = stamps_ns - drifting[GYRO].late_ns(stamps_ns)
@@ -288,7 +291,9 @@ def _judge_following(check: MotionCheck, sources: Sequence[Source], commands: bo
     """
     how = following([one for one in sources if not commands or one.name in (IMAGES, GYRO)])
     if how:
-        check.wrong.append(f"{IMAGES} follow the robot's turns {how}: {_STABILIZED}")
+        text = f"{IMAGES} follow the robot's turns {how}: {_STABILIZED}"
+        check.wrong.append(text)
+        check.timing.append(text)
         check.pairs = [pair for pair in check.pairs if IMAGES not in (pair.a, pair.b)]
 
 
