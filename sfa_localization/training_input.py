@@ -24,8 +24,10 @@ from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.keyframes.closures import Textures, find_closures, views_of
 from sfa_localization.keyframes.leveling import leveled_runs
 from sfa_localization.keyframes.texture import channels
+from sfa_localization.metric.dead_reckoning import OdometryTrack
 from sfa_localization.metric.drives import Drive, Drives
 from sfa_localization.metric.motion_check import MotionCheck, check_drives
+from sfa_localization.metric.motion_truth import timed_points
 from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.odometry_errors import same_scale
 from sfa_localization.metric.points import points_of
@@ -164,7 +166,19 @@ def compared(
             replace(run, yaw_rate=run.yaw_rate or recorded.yaw_rate)
             for run, recorded in zip(corrected, runs, strict=True)
         )
-    return corrected, checks
+    return tuple(map(_with_timed_points, corrected, commands, checks)), checks
+
+
+def _with_timed_points(run: Run, commands: bool, check: MotionCheck) -> Run:
+    """A drive with its measured points as compared with the odometry."""
+    if run.points is None:
+        return run
+    track = OdometryTrack.of(run.odometry, SegmentConfig(), run.yaw_rate)
+    points, texts = timed_points(run.points, track, commands)
+    check.corrected.extend(texts)
+    for text in texts:
+        logger.warning('%s: %s', run.name, text)
+    return replace(run, points=points)
 
 
 def _warn_of_bodies(runs: Sequence[Run], views: Textures, sphere: Sphere) -> None:

@@ -19,7 +19,15 @@ from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.data.errors import CameraError, DataError
 from sfa_localization.data.geometry import align, wrap_angle
-from sfa_localization.data.run import Image, Odometry, PanoramaArray, Run, Trajectory, integrate
+from sfa_localization.data.run import (
+    Image,
+    Odometry,
+    PanoramaArray,
+    Points,
+    Run,
+    Trajectory,
+    integrate,
+)
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
 from sfa_localization.metric.breaks import parted
 from sfa_localization.metric.dead_reckoning import OdometryTrack
@@ -30,7 +38,7 @@ from sfa_localization.metric.motion_sources import (
     TWIST,
     compare_map,
 )
-from sfa_localization.metric.motion_truth import TruePoses, true_poses
+from sfa_localization.metric.motion_truth import TruePoses, timed_points, true_poses
 from sfa_localization.metric.settings import SegmentConfig
 from sfa_localization.training import train
 
@@ -430,6 +438,40 @@ def test_the_truth_of_another_drive_is_refused():
     assert true_poses(other, track, trusted=False).poses is other
     with pytest.raises(DataError, match=r'drives 3\.2\d times as far as odometry: publish meters'):
         true_poses(marked(truth, unit=3.28), track)
+
+
+def fixes(truth, known=0j):
+    """A receiver's points of a truth, with 2 cm of noise, beside true places of base_link."""
+    noise = np.random.default_rng(0).normal(0.0, 0.02, (2, len(truth)))
+    places = truth.poses[:, :2] @ [1, 1j] + [1, 1j] @ noise
+    rows = zip(truth.stamps_ns.tolist(), places.tolist(), strict=True)
+    return Points.of([(str(at), at, place, 0.02, known) for at, place in rows])
+
+
+@pytest.mark.parametrize('name', ['late', 'early', 'marker', 'zeros', 'a place'])
+def test_points_of_a_topic_are_compared_in_time(name):
+    change, text = TRUTHS[name]
+    track, truth = with_truth()
+    points, (sentence,) = timed_points(fixes(change(truth)), track)
+    assert sentence.startswith('points_topic') and text in sentence
+    poses = truth.at(points.stamps_ns)
+    antenna = poses[:, :2] @ [1, 1j] + points.lever * np.exp(1j * poses[:, 2])
+    inside = truth.covers(points.stamps_ns)
+    assert np.abs(points.places - antenna)[inside].max() < 0.12
+
+
+def test_right_points_stay_as_they_are_and_those_of_another_shape_are_for_the_map_to_refuse():
+    track, truth = with_truth()
+    aside = fixes(marked(truth, lever=0.3j), known=0.3j)
+    points, (sentence,) = timed_points(aside, track)
+    assert 'to the left of base_link' in sentence
+    assert np.abs(points.lever - 0.3j).max() < 0.02
+    right = fixes(truth)
+    points, texts = timed_points(right, track)
+    assert not texts and points.rows() == right.rows()
+    for wrong in marked(truth, swapped=True), marked(truth, unit=1000.0), with_truth(seed=5)[1]:
+        points = fixes(wrong)
+        assert timed_points(points, track) == (points, [])
 
 
 def test_odometry_of_commands_shows_no_delay_of_a_truth():

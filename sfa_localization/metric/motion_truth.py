@@ -24,13 +24,13 @@ from scipy.sparse import csr_array
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_angle
-from sfa_localization.data.run import Trajectory
+from sfa_localization.data.run import Points, Trajectory
 from sfa_localization.data.statistics import LENGTH_TO_STD, evenly, outlier_factor, surprise
 from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack
 from sfa_localization.metric.motion_samples import fault_sentence, faulty
 from sfa_localization.metric.motion_sources import ALIKE, EQUAL, LATE_S, late
 
-TRUTH = 'ground truth'
+TRUTH, POINTS = 'ground truth', 'points_topic'
 WINDOW_M, WINDOWS_MIN, NOISE_M = 3.0, 4, 0.01
 """Length of a window, in which wheels deviate by the last value. Fewer windows show nothing."""
 UNSTEADY = 0.15
@@ -242,6 +242,21 @@ class _Comparison:
             fit = min(fewer, key=lambda fit: fit.cost(FAULT_M), default=fit)
         return fit
 
+    def agreed(self, free: Mask) -> _Fit | None:
+        """The best fit without faulty samples, which are no longer `used`; None without enough
+        motion. One of another motion is unsteady.
+        """
+        self.used = ~self.faults(None)
+        fit = self.best(free)
+        if fit is None or fit.unsteady > UNSTEADY:
+            return fit
+        for _ in range(3):
+            fit, before = self.settled(fit, free), self.used
+            self.used = ~self.faults(fit)
+            if (before == self.used).all():
+                break
+        return fit
+
     def faults(self, fit: _Fit | None) -> Mask:
         """Samples (N,) that repeat the last pose while the robot drives on, or which a jump takes
         away from where the odometry puts them.
@@ -300,8 +315,7 @@ def true_poses(
     factor = max(factor, 1e-9)
     unit = min(_UNITS, key=lambda unit: abs(np.log(factor / unit)))
     comparison.places /= unit
-    comparison.used = ~comparison.faults(None)
-    fit = comparison.best(free)
+    fit = comparison.agreed(free)
     if fit is None or (fit.unsteady > UNSTEADY and not trusted):
         return TruePoses(truth)
     if fit.unsteady > UNSTEADY:
@@ -310,35 +324,57 @@ def true_poses(
         )
     if not 1 / EQUAL < factor / unit < EQUAL:
         raise DataError(f'{TRUTH} drives {factor:.3g} times as far as odometry: publish meters')
-    for _ in range(3):
-        fit = comparison.settled(fit, free)
-        before, comparison.used = comparison.used, ~comparison.faults(fit)
-        if (before == comparison.used).all():
-            break
     return _corrected(truth, comparison, fit, unit)
+
+
+def _differences(fit: _Fit) -> list[str]:
+    """How what is fitted differs from base_link in time and place, in sentences."""
+    x, y, late_s, _ = fit.theta.tolist()
+    ahead = f'{abs(x):.2f} m {"ahead of" if x > 0 else "behind"}'
+    side = f'{abs(y):.2f} m to the {"left" if y > 0 else "right"} of base_link'
+    texts = [f'is stamped {late(late_s)}; taken into account'] if late_s else []
+    return [*texts, f'lies {ahead} and {side}; taken into account'] if x or y else texts
 
 
 def _corrected(truth: Trajectory, comparison: _Comparison, fit: _Fit, unit: float) -> TruePoses:
     """The truth after all corrections; itself if there are none."""
     yaw, text, headings = comparison.headings(fit)
-    x, y, late_s, _ = fit.theta.tolist()
-    ahead = f'{abs(x):.2f} m {"ahead of" if x > 0 else "behind"}'
-    side = f'{abs(y):.2f} m to the {"left" if y > 0 else "right"} of base_link'
-    texts = {
-        f'is in {_UNITS[unit]}; converted': unit != 1.0,
-        'is mirrored (y to the right, or x and y swapped); turned around': fit.mirrored,
-        f'is stamped {late(late_s)}; taken into account': late_s != 0,
-        f'lies {ahead} and {side}; taken into account': x != 0,
-        text: bool(text),
-    }
+    texts = [f'is in {_UNITS[unit]}; converted'] if unit != 1.0 else []
+    if fit.mirrored:
+        texts.append('is mirrored (y to the right, or x and y swapped); turned around')
+    texts += [*_differences(fit), *([text] if text else [])]
     faults = fault_sentence(TRUTH, ~comparison.used, truth.stamps_ns, 'odometry')
-    sentences = [f'{TRUTH} {text}' for text, applies in texts.items() if applies]
-    sentences += [faults] if faults else []
+    sentences = [f'{TRUTH} {text}' for text in texts] + [faults] * bool(faults)
     if not sentences:
         return TruePoses(truth)
     places = comparison.places.conj() if fit.mirrored else comparison.places
-    places = places - complex(x, y) * np.exp(1j * yaw)
+    places = places - complex(*fit.theta[:2]) * np.exp(1j * yaw)
     poses = np.column_stack([places.real, places.imag, wrap_angle(yaw)])
-    stamps_ns = truth.stamps_ns - round(late_s * 1e9)
+    stamps_ns = truth.stamps_ns - round(fit.theta[2] * 1e9)
     kept = Trajectory(stamps_ns[comparison.used], poses[comparison.used])
     return TruePoses(kept, headings, tuple(sentences))
+
+
+def timed_points(
+    points: Points, track: OdometryTrack, open_loop: bool = False
+) -> tuple[Points, list[str]]:
+    """Points of a topic by the clock of the odometry and with the lever arm of their antenna,
+    without those that contradict the odometry; and sentences on it.
+
+    Points that have not the shape and size of the drive are not changed: see `settle`.
+    """
+    places = np.column_stack([points.places.real, points.places.imag, np.zeros(len(points))])
+    comparison = _Comparison(Trajectory(points.stamps_ns, places), track)
+    fit = comparison.agreed(np.array([True, True, not open_loop, True]))
+    alike = fit and not fit.mirrored and fit.unsteady <= UNSTEADY
+    if not fit or not alike or not 1 / EQUAL < comparison.scale() < EQUAL:
+        return points, []
+    rows, lever = np.flatnonzero(comparison.used), complex(*fit.theta[:2])
+    late_ns = round(fit.theta[2] * 1e9)
+    timed = [
+        (name, stamp_ns - late_ns, place, std, lever or known)
+        for name, stamp_ns, place, std, known in points.rows()
+    ]
+    faults = fault_sentence(POINTS, ~comparison.used, points.stamps_ns, 'odometry')
+    texts = [f'{POINTS} {text}' for text in _differences(fit)] + [faults] * bool(faults)
+    return Points.of([timed[row] for row in rows]), texts

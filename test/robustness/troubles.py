@@ -236,6 +236,15 @@ def fixed(m, rng):
     return [answer]
 
 
+def late_fixes(m, rng):
+    """The same receiver 0.3 s late, with an antenna 0.4 m ahead that no tf states."""
+    yaw = 2 * math.atan2(m.pose.orientation.z, m.pose.orientation.w)
+    m.pose.position.x += 0.4 * math.cos(yaw)
+    m.pose.position.y += 0.4 * math.sin(yaw)
+    restamp(m, stamp_of(m) + 300_000_000)
+    return fixed(m, rng)
+
+
 def unpacked(m, _):
     """A driver that leaves out the step of raw images."""
     image = decode_compressed(m.data)
@@ -427,6 +436,11 @@ TROUBLES = {
     ),
     'points: fixes of a receiver': Trouble(
         lambda: {TRUTH: fixed}, (0.06, 0.07), 'latitude .*, longitude .* is the origin',
+        options=('--points-topic', TRUTH), kinds={TRUTH: FIX},
+    ),
+    'points: 0.3 s late, antenna 0.4 m ahead': Trouble(
+        # The truth, which lies there too, is placed by the wheels of a test drive of 32 s.
+        lambda: {TRUTH: late_fixes}, (0.07, 0.09), 'points_topic is stamped 0.3. s late',
         options=('--points-topic', TRUTH), kinds={TRUTH: FIX},
     ),
     'images: step left out': Trouble(
