@@ -395,6 +395,8 @@ TRUTHS = {
         '32 of 644 messages con',
     ),
     'held': (lambda t: with_poses(t, np.s_[301:316], t.poses[300]), 'up to 16 in a row'),
+    'lost': (lambda t: with_poses(t, np.s_[-90:], 999.0), '90 of 644 messages contradict'),
+    'lost at first': (lambda t: with_poses(t, np.s_[:60], -1.0), '60 of 644 messages contradict'),
 }
 
 
@@ -438,6 +440,17 @@ def test_the_truth_of_another_drive_is_refused():
     assert true_poses(other, track, trusted=False).poses is other
     with pytest.raises(DataError, match=r'drives 3\.2\d times as far as odometry: publish meters'):
         true_poses(marked(truth, unit=3.28), track)
+
+
+def test_a_truth_that_is_started_anew_is_reported():
+    track, truth = with_truth()
+    moved = truth.poses.copy()
+    moved[300:] += [2.0, -1.0, 0.0]
+    mended = true_poses(with_poses(truth, np.s_[:], moved), track)
+    at_s = (truth.stamps_ns[300] - truth.stamps_ns[0]) * 1e-9
+    (sentence,) = mended.sentences
+    assert re.search(rf'jumps once by 2\.[0-3]. m after {at_s:.1f} s', sentence)
+    assert len(mended.poses) == len(truth)
 
 
 def fixes(truth, known=0j):

@@ -27,7 +27,7 @@ from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_a
 from sfa_localization.data.run import Points, Trajectory
 from sfa_localization.data.statistics import LENGTH_TO_STD, evenly, outlier_factor, surprise
 from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack
-from sfa_localization.metric.motion_samples import fault_sentence, faulty
+from sfa_localization.metric.motion_samples import OUTLIER, fault_sentence, faulty
 from sfa_localization.metric.motion_sources import ALIKE, EQUAL, LATE_S, late
 
 TRUTH, POINTS = 'ground truth', 'points_topic'
@@ -278,6 +278,21 @@ class _Comparison:
         _, value = np.unique(self.places, return_inverse=True)
         return np.asarray(mask | (np.bincount(value, mask) > np.bincount(value) / 2)[value])
 
+    def jumps(self, fit: _Fit) -> str:
+        """Where the used samples jump farther than the robot drives in as much time, up to a second
+        before or after, in words; '' if they do not.
+        """
+        seconds, places = self.seconds[self.used], self.places[self.used]
+        shifted_s = seconds - fit.theta[2] + np.linspace(-1.0, 1.0, 11)[:, None]
+        step, way = np.abs(np.diff(places)), np.diff(np.interp(shifted_s, self.track_s, self.way))
+        noise = np.hypot(np.sqrt(2) * fit.std, WHEELS_STD * way.max(0))  # of two samples
+        far = step - way.max(0) > np.maximum(OUTLIER * noise, FAULT_M)
+        if not far.any():
+            return ''
+        first, often = int(np.argmax(far)), f'{far.sum()} times, first' if far.sum() > 1 else 'once'
+        at_s = seconds[first + 1] - self.seconds[0]
+        return f'jumps {often} by {step[first]:.2f} m after {at_s:.1f} s: was it started anew?'
+
     def headings(self, fit: _Fit) -> tuple[Array, str, bool]:
         """Headings (N,) rad of base_link, with a sentence on what was corrected of those of the
         truth, and whether it has any.
@@ -342,7 +357,7 @@ def _corrected(truth: Trajectory, comparison: _Comparison, fit: _Fit, unit: floa
     texts = [f'is in {_UNITS[unit]}; converted'] if unit != 1.0 else []
     if fit.mirrored:
         texts.append('is mirrored (y to the right, or x and y swapped); turned around')
-    texts += [*_differences(fit), *([text] if text else [])]
+    texts += [*_differences(fit), *filter(None, (text, comparison.jumps(fit)))]
     faults = fault_sentence(TRUTH, ~comparison.used, truth.stamps_ns, 'odometry')
     sentences = [f'{TRUTH} {text}' for text in texts] + [faults] * bool(faults)
     if not sentences:
