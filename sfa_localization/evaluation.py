@@ -88,29 +88,19 @@ class Evaluation:
 
 
 @dataclass(frozen=True, slots=True)
-class _Localized:
-    """A drive, localized by model and filter.
+class _Located:
+    """A drive whose images the model located, compared with its ground truth.
 
-    `tracks` are in the map: 'sfa' of the usable images with `features` (N, K), 'ekf' of the filter
-    at each odometry message, and 'smoothed' on request. `localised` (T,) tells where the filter
-    said LOCALISED.
+    `images` are the poses of the usable ones in the map, where they were taken; `clock` is that of
+    the camera. The `sentences` say what was corrected, of the truth and of clocks.
     """
 
     run: Run
+    observations: list[Observation]
     true: TruePoses
-    tracks: dict[str, FilterTrack]
-    features: Array
-    localised: Mask
-    counts: dict[str, Any]
+    images: FilterTrack
+    clock: CameraClock
     sentences: tuple[str, ...]
-    """What was corrected, of the truth and of clocks, and how images follow the robot."""
-
-    def estimates(self, transform: RigidTransform) -> dict[str, Trajectory]:
-        """Poses in the frame of the truth, without headings if the truth has none."""
-        poses = {'odometry': odometry_from_start(self.true.poses, self.run)}
-        poses |= {name: moved(track.poses, transform) for name, track in self.tracks.items()}
-        axes = [1.0, 1.0, 1.0 if self.true.headings else np.nan]
-        return {name: Trajectory(p.stamps_ns, p.poses * axes) for name, p in poses.items()}
 
 
 @one_core()
@@ -134,36 +124,53 @@ def evaluate(
     DataError, also without ground truth.
     """
     recipe = as_live(recipe or Recipe(), model.panorama, model.mount_rpy)
-    recipe, training_drives = replace(recipe, origin=model.origin), list[_Localized]()
+    recipe, drives = replace(recipe, origin=model.origin), list[_Located]()
     for path in align_bags:
         here = _with_topics_of(path, recipe)
-        training_drives.append(_localized(path, Localizer(model, config, watch), here, progress))
-        recipe = replace(recipe, origin=training_drives[-1].run.origin)
-    kind = Smoother if smooth else PoseFilter
-    drive = _localized(bag, Localizer(model, config, watch, kind), recipe, progress)
+        drives.append(_located(path, Observer(model, watch), here, progress))
+        recipe = replace(recipe, origin=drives[-1].run.origin)
+    localizer = Localizer(model, config, watch, Smoother if smooth else PoseFilter)
+    drives.append(_located(bag, localizer.observer, recipe, progress))
     aligned_on = 'nothing: coordinates of the map'
     if transform is None:
         aligned_on = ', '.join(map(str, align_bags or [bag]))
-        fitted = training_drives or [drive]
-        transform = fit_transform(*((d.true.poses, d.tracks['sfa'].poses) for d in fitted))
-    truth, estimates = drive.true.poses, drive.estimates(transform)
-    scores = _scores(drive, estimates, rotation(transform.yaw_rad))
-    counts = {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])}
-    drives = *training_drives, drive
+        fitted = drives[: len(align_bags) or 1]
+        transform = fit_transform(*((d.true.poses, d.images.poses) for d in fitted))
     corrections = tuple(f'{d.run.name}: {text}' for d in drives for text in d.sentences)
+    return _judged(drives[-1], localizer.filter, transform, aligned_on, corrections)
+
+
+def _judged(
+    drive: _Located,
+    fused: PoseFilter,
+    transform: RigidTransform,
+    aligned_on: str,
+    corrections: tuple[str, ...],
+) -> Evaluation:
+    """Feed a filter with a drive, and compare the estimates with the truth."""
+    stamps_ns, observations, truth = drive.run.panoramas.stamps_ns, drive.observations, drive.true
+    fed = replay(fused, drive.run.odometry, stamps_ns, observations)
+    outputs = [(at, fused.status.level, fused.at(at)) for at, image, _ in fed if image is None]
+    states = [state for *_, state in outputs if state]
+    tracks = {'sfa': drive.images, 'ekf': FilterTrack.of(states)}
+    if isinstance(fused, Smoother):
+        tracks['smoothed'] = FilterTrack.of(fused.smoothed())
+    poses = {'odometry': odometry_from_start(truth.poses, drive.run)}
+    poses |= {name: moved(track.poses, transform) for name, track in tracks.items()}
+    axes = [1.0, 1.0, 1.0 if truth.headings else np.nan]
+    estimates = {name: Trajectory(p.stamps_ns, p.poses * axes) for name, p in poses.items()}
+    scores = {name: score(truth.poses, estimate) for name, estimate in estimates.items()}
+    for name, track in tracks.items():
+        turn = rotation(transform.yaw_rad)
+        scores[name] |= calibration(truth.poses, estimates[name], turn, track.covariances)
+        scores[name]['similarity'] = similarity(truth.poses, estimates[name])
+    localised = np.array([level is Level.LOCALISED for _, level, state in outputs if state])
+    wrong_s = _false_localised_s(truth.poses, estimates['ekf'], localised)
+    counts = {**_counts(drive, outputs, fused), 'false_localised_s': wrong_s}
+    features = np.array([image.slow_features for image in observations if not image.problem])
     return Evaluation(
-        truth, estimates, scores, counts, drive.features, aligned_on, transform, corrections
+        truth.poses, estimates, scores, counts, features, aligned_on, transform, corrections
     )
-
-
-def _scores(drive: _Localized, estimates: dict[str, Trajectory], turn: Array) -> Scores:
-    """Errors and calibration of the estimates; `turn` (2, 2) leads from the map to the truth."""
-    truth = drive.true.poses
-    scores = {name: score(truth, estimate) for name, estimate in estimates.items()}
-    for name, track in drive.tracks.items():
-        scores[name] |= calibration(truth, estimates[name], turn, track.covariances)
-        scores[name]['similarity'] = similarity(truth, estimates[name])
-    return scores
 
 
 def observed(
@@ -233,40 +240,28 @@ def _compared(
     return check, true
 
 
-def _localized(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Localized:
-    """Run model and filter over a bag. Raises BagError or DataError."""
-    run, fused = _read(bag, recipe, progress), localizer.filter
-    observations = _observations(run, localizer.observer, progress)
+def _located(bag: Path, observer: Observer, recipe: Recipe, progress: bool) -> _Located:
+    """Locate the images of a bag. Raises BagError or DataError."""
+    run = _read(bag, recipe, progress)
+    observations = _observations(run, observer, progress)
     usable = [observation for observation in observations if not observation.problem]
     if not usable:
         raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
     turns, open_loop = _turns(run, observations), OpenLoop.of(run.odometry.twists).repeats
     check, true = _compared(run, turns, open_loop)
-    fed = replay(fused, run.odometry, run.panoramas.stamps_ns, observations)
-    outputs = [(at, fused.status.level, fused.at(at)) for at, image, _ in fed if image is None]
     clock = camera_clock(run.odometry, *turns)
     late = check.image_drift or Drift(0, clock.delay_ns * 1e-9, 0.0)
     if open_loop:  # the robot is late, not the images
         late = Drift(0, 0.0, 0.0)
-    states = [state for *_, state in outputs if state]
-    tracks = {'sfa': _track(usable, late), 'ekf': FilterTrack.of(states)}
-    if isinstance(fused, Smoother):
-        tracks['smoothed'] = FilterTrack.of(fused.smoothed())
-    features = np.array([observation.slow_features for observation in usable])
-    localised = np.array([level is Level.LOCALISED for _, level, state in outputs if state])
-    counts = _counts(run, observations, outputs, fused, clock)
     sentences = (*check.timing, *true.sentences)
-    return _Localized(run, true, tracks, features, localised, counts, sentences)
+    return _Located(run, observations, true, _track(usable, late), clock, sentences)
 
 
 def _counts(
-    run: Run,
-    observations: Sequence[Observation],
-    outputs: Sequence[tuple[int, Level, State | None]],
-    fused: PoseFilter,
-    clock: CameraClock,
+    drive: _Located, outputs: Sequence[tuple[int, Level, State | None]], fused: PoseFilter
 ) -> dict[str, Any]:
     """Used and skipped messages and images, the filter's counts, and seconds in each state."""
+    run, observations, clock = drive.run, drive.observations, drive.clock
     skipped = Counter(problem for item in observations if (problem := item.problem))
     usable = Count(len(observations) - skipped.total(), dict(skipped))
     states_s = Counter[str]()
@@ -389,10 +384,10 @@ def _effective_count(normalized: Array) -> float:
     return count / (1 + 2 * float(((shared[1:] / shared[0]) ** 2).sum())) if len(shared) else count
 
 
-def _false_localised_s(drive: _Localized, ekf: Trajectory) -> float:
+def _false_localised_s(truth: Trajectory, ekf: Trajectory, localised: Mask) -> float:
     """Seconds in which the filter said LOCALISED and its position error exceeded `WRONG_M`."""
-    mask, errors = _errors(drive.true.poses, ekf)
-    wrong = drive.localised[mask] & (np.hypot(*errors[:, :2].T) > WRONG_M)
+    mask, errors = _errors(truth, ekf)
+    wrong = localised[mask] & (np.hypot(*errors[:, :2].T) > WRONG_M)
     return float(_seconds_since_last(ekf.stamps_ns)[mask][wrong].sum())
 
 

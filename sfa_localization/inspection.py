@@ -22,7 +22,7 @@ from sfa_localization.bags import decoding
 from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S
 from sfa_localization.bags.motion_arrays import to_yaw_rate
 from sfa_localization.bags.reader import Bag
-from sfa_localization.bags.settings import BagConfig, TopicNames
+from sfa_localization.bags.settings import TopicNames
 from sfa_localization.bags.topic_stream import Stream, clock_offset
 from sfa_localization.camera import body, kinds
 from sfa_localization.camera.panorama import looks_like_panorama
@@ -238,7 +238,6 @@ def inspect(
     *,
     topics: TopicNames | None = None,
     config: InspectionConfig | None = None,
-    bag_config: BagConfig | None = None,
     clockwise: bool = True,
     strict: bool = False,
 ) -> BagReport:
@@ -248,7 +247,7 @@ def inspect(
     """
     topics, config = topics or TopicNames(), config or InspectionConfig()
     report = BagReport(str(path))
-    with Bag(path, strict=strict, config=bag_config) as bag:
+    with Bag(path, strict=strict) as bag:
         report.image_topic = _topic_of(bag, 'image', topics.image, report)
         report.odometry_topic = _topic_of(bag, 'odometry', topics.odometry, report)
         _Survey(bag, report, topics, clockwise).fill()
