@@ -334,12 +334,9 @@ def similarity(truth: Trajectory, estimate: Trajectory) -> dict[str, float | Non
     estimated, true = _pairs(truth, estimate)
     if len(estimated) < 2:
         return {'mean': None, 'scale': None}
-    aligned, center = align(estimated, true).apply(estimated), true.mean(0)
-    offset = aligned - aligned.mean(0)
-    square = float((offset**2).sum())
-    scale = float((offset * (true - center)).sum()) / square if square > 0 else 1.0
-    errors = np.hypot(*(scale * offset + center - true).T)
-    return {'mean': float(errors.mean()), 'scale': scale}
+    places, target = ((z - z.mean()) for z in (estimated @ [1.0, 1.0j], true @ [1.0, 1.0j]))
+    fit = np.vdot(places, target) / max(np.vdot(places, places).real, 1e-12)
+    return {'mean': float(np.abs(fit * places - target).mean()), 'scale': float(abs(fit))}
 
 
 def calibration(

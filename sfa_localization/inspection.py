@@ -554,10 +554,10 @@ def lacks_together(reports: Sequence[BagReport], config: InspectionConfig) -> li
     """The reasons why bags are not enough to train one model on all of them."""
     names: dict[str, list[str]] = {}
     for report in reports:
-        every = [report.error.removeprefix(f'{report.path}: ')] if report.error else report.lacks
-        for lack in every:
-            names.setdefault(lack, []).extend([report.path] * (lack not in report.of_drive))
-    texts = [f'{", ".join(paths)}: {lack}' for lack, paths in names.items() if paths]
+        error = [report.error.removeprefix(f'{report.path}: ')] if report.error else []
+        for lack in error or [lack for lack in report.lacks if lack not in report.of_drive]:
+            names.setdefault(lack, []).append(report.path)
+    texts = [f'{", ".join(paths)}: {lack}' for lack, paths in names.items()]
     images = [(r, topic) for r in reports for topic in r.topics if topic.name == r.image_topic]
     for (first, one), (second, other) in combinations(images, 2):
         if one.count and np.array_equal(one.stamps_ns, other.stamps_ns):
