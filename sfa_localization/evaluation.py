@@ -12,8 +12,9 @@ import logging
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,6 @@ from scipy import signal, stats
 from sfa_localization.bags.drives import as_live, image_folder, read_drive
 from sfa_localization.bags.reader import Bag
 from sfa_localization.camera.settings import WatchConfig
-from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import (
     Array,
@@ -88,39 +88,19 @@ class Evaluation:
 
 
 @dataclass(frozen=True, slots=True)
-class _Localized:
-    """A drive, localized by model and filter.
+class _Located:
+    """A drive whose images the model located, compared with its ground truth.
 
-    `tracks` are in the map: 'sfa' of the usable images with `features` (N, K), 'ekf' of the filter
-    at each odometry message, and 'smoothed' on request. `localised` (T,) tells where the filter
-    said LOCALISED.
+    `images` are the poses of the usable ones in the map, where they were taken; `clock` is that of
+    the camera. The `sentences` say what was corrected, of the truth and of clocks.
     """
 
     run: Run
+    observations: list[Observation]
     true: TruePoses
-    tracks: dict[str, FilterTrack]
-    features: Array
-    localised: Mask
-    counts: dict[str, Any]
+    images: FilterTrack
+    clock: CameraClock
     sentences: tuple[str, ...]
-    """What was corrected, of the truth and of clocks, and how images follow the robot."""
-
-    @property
-    def truth(self) -> Trajectory:
-        """True poses of base_link."""
-        return self.true.poses
-
-    @property
-    def images(self) -> Trajectory:
-        """Poses of the usable images in the map."""
-        return self.tracks['sfa'].poses
-
-    def estimates(self, transform: RigidTransform) -> dict[str, Trajectory]:
-        """Poses in the frame of the truth, without headings if the truth has none."""
-        poses = {'odometry': odometry_from_start(self.truth, self.run)}
-        poses |= {name: moved(track.poses, transform) for name, track in self.tracks.items()}
-        axes = [1.0, 1.0, 1.0 if self.true.headings else np.nan]
-        return {name: Trajectory(p.stamps_ns, p.poses * axes) for name, p in poses.items()}
 
 
 @one_core()
@@ -144,34 +124,53 @@ def evaluate(
     DataError, also without ground truth.
     """
     recipe = as_live(recipe or Recipe(), model.panorama, model.mount_rpy)
-    recipe, training_drives = replace(recipe, origin=model.origin), list[_Localized]()
+    recipe, drives = replace(recipe, origin=model.origin), list[_Located]()
     for path in align_bags:
         here = _with_topics_of(path, recipe)
-        training_drives.append(_localized(path, Localizer(model, config, watch), here, progress))
-        recipe = replace(recipe, origin=training_drives[-1].run.origin)
-    kind = Smoother if smooth else PoseFilter
-    drive = _localized(bag, Localizer(model, config, watch, kind), recipe, progress)
+        drives.append(_located(path, Observer(model, watch), here, progress))
+        recipe = replace(recipe, origin=drives[-1].run.origin)
+    localizer = Localizer(model, config, watch, Smoother if smooth else PoseFilter)
+    drives.append(_located(bag, localizer.observer, recipe, progress))
     aligned_on = 'nothing: coordinates of the map'
     if transform is None:
         aligned_on = ', '.join(map(str, align_bags or [bag]))
-        transform = fit_transform(*((d.truth, d.images) for d in training_drives or [drive]))
-    estimates = drive.estimates(transform)
-    scores = _scores(drive, estimates, rotation(transform.yaw_rad))
-    counts = {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])}
-    drives = *training_drives, drive
+        fitted = drives[: len(align_bags) or 1]
+        transform = fit_transform(*((d.true.poses, d.images.poses) for d in fitted))
     corrections = tuple(f'{d.run.name}: {text}' for d in drives for text in d.sentences)
+    return _judged(drives[-1], localizer.filter, transform, aligned_on, corrections)
+
+
+def _judged(
+    drive: _Located,
+    fused: PoseFilter,
+    transform: RigidTransform,
+    aligned_on: str,
+    corrections: tuple[str, ...],
+) -> Evaluation:
+    """Feed a filter with a drive, and compare the estimates with the truth."""
+    stamps_ns, observations, truth = drive.run.panoramas.stamps_ns, drive.observations, drive.true
+    fed = replay(fused, drive.run.odometry, stamps_ns, observations)
+    outputs = [(at, fused.status.level, fused.at(at)) for at, image, _ in fed if image is None]
+    states = [state for *_, state in outputs if state]
+    tracks = {'sfa': drive.images, 'ekf': FilterTrack.of(states)}
+    if isinstance(fused, Smoother):
+        tracks['smoothed'] = FilterTrack.of(fused.smoothed())
+    poses = {'odometry': odometry_from_start(truth.poses, drive.run)}
+    poses |= {name: moved(track.poses, transform) for name, track in tracks.items()}
+    axes = [1.0, 1.0, 1.0 if truth.headings else np.nan]
+    estimates = {name: Trajectory(p.stamps_ns, p.poses * axes) for name, p in poses.items()}
+    scores = {name: score(truth.poses, estimate) for name, estimate in estimates.items()}
+    for name, track in tracks.items():
+        turn = rotation(transform.yaw_rad)
+        scores[name] |= calibration(truth.poses, estimates[name], turn, track.covariances)
+        scores[name]['similarity'] = similarity(truth.poses, estimates[name])
+    localised = np.array([level is Level.LOCALISED for _, level, state in outputs if state])
+    wrong_s = _false_localised_s(truth.poses, estimates['ekf'], localised)
+    counts = {**_counts(drive, outputs, fused), 'false_localised_s': wrong_s}
+    features = np.array([image.slow_features for image in observations if not image.problem])
     return Evaluation(
-        drive.truth, estimates, scores, counts, drive.features, aligned_on, transform, corrections
+        truth.poses, estimates, scores, counts, features, aligned_on, transform, corrections
     )
-
-
-def _scores(drive: _Localized, estimates: Mapping[str, Trajectory], turn: Array) -> Scores:
-    """Errors and calibration of the estimates; `turn` (2, 2) leads from the map to the truth."""
-    scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
-    for name, track in drive.tracks.items():
-        scores[name] |= calibration(drive.truth, estimates[name], turn, track.covariances)
-        scores[name]['similarity'] = similarity(drive.truth, estimates[name])
-    return scores
 
 
 def observed(
@@ -182,17 +181,27 @@ def observed(
     Raises BagError or DataError, also without a wanted truth.
     """
     run = _read(bag, recipe, progress, want_truth)
+    observations = _observations(run, observer, progress)
     if want_truth:
-        _, true = _compared(run, list(headings(run.panoramas)))
+        _, true = _compared(
+            run, _turns(run, observations), OpenLoop.of(run.odometry.twists).repeats
+        )
         for text in true.sentences:
             logger.warning('%s: %s', run.name, text)
         run = replace(run, ground_truth=true.poses)
-    return run, list(_observations(run, observer, progress))
+    return run, observations
 
 
-def _observations(run: Run, observer: Observer, progress: bool) -> Iterator[Observation]:
-    title = f'locate the images of {run.name}'
-    return progress_over(observer.observe_run(run), title, len(run.panoramas), visible=progress)
+def _observations(run: Run, observer: Observer, progress: bool) -> list[Observation]:
+    title, images = f'locate the images of {run.name}', observer.observe_run(run)
+    return list(progress_over(images, title, len(run.panoramas), visible=progress))
+
+
+def _turns(run: Run, observations: Sequence[Observation]) -> tuple[Stamps, Array]:
+    """Stamps (N,) of the usable images, and how far they have turned from any start, rad."""
+    turned = np.array([image.turned for image in observations])
+    usable = np.isfinite(turned)
+    return run.panoramas.stamps_ns[usable], turned[usable]
 
 
 def _with_topics_of(path: Path, recipe: Recipe) -> Recipe:
@@ -215,15 +224,14 @@ def _read(bag: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Run:
     return run
 
 
-def _compared(run: Run, turns: Sequence[float]) -> tuple[MotionCheck, TruePoses]:
+def _compared(
+    run: Run, turns: tuple[Stamps, Array], open_loop: bool
+) -> tuple[MotionCheck, TruePoses]:
     """The comparison of the sources of motion, and the poses of base_link by the ground truth, as
-    compared with the odometry; `turns` are the headings of the images. Raises DataError for the
-    truth of another drive.
+    compared with the odometry. Raises DataError for the truth of another drive.
     """
     assert run.ground_truth is not None
-    images = run.panoramas.stamps_ns, np.array(turns)
-    open_loop = OpenLoop.of(run.odometry.twists).repeats
-    check = check_motion(run.odometry, images, run.yaw_rate, commands=open_loop)
+    check = check_motion(run.odometry, turns, run.yaw_rate, commands=open_loop)
     track = OdometryTrack.of(check.odometry, SegmentConfig(), check.gyro)
     try:
         true = true_poses(run.ground_truth, track, check.confirmed, open_loop)
@@ -232,51 +240,34 @@ def _compared(run: Run, turns: Sequence[float]) -> tuple[MotionCheck, TruePoses]
     return check, true
 
 
-def _localized(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Localized:
-    """Run model and filter over a bag. Raises BagError or DataError."""
-    run, fused = _read(bag, recipe, progress), localizer.filter
-    turns = list(headings(run.panoramas))
-    check, true = _compared(run, turns)
-    observations, levels = list[Observation](), dict[int, Level]()
-    states, localised = list[State](), list[bool]()
-    images = run.panoramas.stamps_ns, _observations(run, localizer.observer, progress)
-    for stamp_ns, observation, _ in replay(fused, run.odometry, *images):
-        if observation is not None:
-            observations.append(observation)
-            continue
-        levels[stamp_ns] = fused.status.level
-        if state := fused.at(stamp_ns):
-            states.append(state)
-            localised.append(fused.status.level is Level.LOCALISED)
+def _located(bag: Path, observer: Observer, recipe: Recipe, progress: bool) -> _Located:
+    """Locate the images of a bag. Raises BagError or DataError."""
+    run = _read(bag, recipe, progress)
+    observations = _observations(run, observer, progress)
     usable = [observation for observation in observations if not observation.problem]
     if not usable:
         raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
-    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, turns)
-    counts = _counts(run, observations, levels, fused, clock)
+    turns, open_loop = _turns(run, observations), OpenLoop.of(run.odometry.twists).repeats
+    check, true = _compared(run, turns, open_loop)
+    clock = camera_clock(run.odometry, *turns)
     late = check.image_drift or Drift(0, clock.delay_ns * 1e-9, 0.0)
-    if OpenLoop.of(run.odometry.twists).repeats:  # the robot is late, not the images
+    if open_loop:  # the robot is late, not the images
         late = Drift(0, 0.0, 0.0)
-    tracks = {'sfa': _track(usable, late), 'ekf': FilterTrack.of(states)}
-    if isinstance(fused, Smoother):
-        tracks['smoothed'] = FilterTrack.of(fused.smoothed())
-    features = np.array([observation.slow_features for observation in usable])
     sentences = (*check.timing, *true.sentences)
-    return _Localized(run, true, tracks, features, np.array(localised), counts, sentences)
+    return _Located(run, observations, true, _track(usable, late), clock, sentences)
 
 
 def _counts(
-    run: Run,
-    observations: Sequence[Observation],
-    levels: Mapping[int, Level],
-    fused: PoseFilter,
-    clock: CameraClock,
+    drive: _Located, outputs: Sequence[tuple[int, Level, State | None]], fused: PoseFilter
 ) -> dict[str, Any]:
     """Used and skipped messages and images, the filter's counts, and seconds in each state."""
+    run, observations, clock = drive.run, drive.observations, drive.clock
     skipped = Counter(problem for item in observations if (problem := item.problem))
     usable = Count(len(observations) - skipped.total(), dict(skipped))
     states_s = Counter[str]()
-    seconds = _seconds_since_last(np.array([run.odometry.stamps_ns[0], *levels]))[1:]
-    for level, lasted_s in zip(levels.values(), seconds.tolist(), strict=True):
+    stamps_ns = [run.odometry.stamps_ns[0], *(stamp_ns for stamp_ns, *_ in outputs)]
+    seconds = _seconds_since_last(np.array(stamps_ns))[1:].tolist()
+    for (_, level, _), lasted_s in zip(outputs, seconds, strict=True):
         states_s[level.name] += lasted_s
     return {
         **{name: count.as_dict() for name, count in run.counts.items()},
@@ -312,15 +303,26 @@ def fit_transform(*drives: tuple[Trajectory, Trajectory]) -> RigidTransform:
     """Least-squares rotation and translation from the map to the truth, over drives that are each
     given as (truth, estimate in the map). Raises DataError.
     """
-    estimated, true = (np.concatenate(parts) for parts in zip(*map(_pairs, drives), strict=True))
+    estimated, true = (
+        np.concatenate(parts) for parts in zip(*starmap(_pairs, drives), strict=True)
+    )
     if len(estimated) < 2:
         raise DataError('the ground truth covers fewer than two images: are the clocks the same?')
     return align(estimated, true)
 
 
-def _pairs(drive: tuple[Trajectory, Trajectory]) -> tuple[Array, Array]:
-    """Estimated and true positions (N, 2) m of a (truth, estimate), where both exist."""
-    truth, estimate = drive
+def _errors(truth: Trajectory, estimate: Trajectory) -> tuple[Mask, Array]:
+    """Mask (N,) of the estimates for which the truth was recorded, and their errors (M, 3): x m,
+    y m, yaw rad.
+    """
+    mask = has_truth(truth, estimate.stamps_ns)
+    errors = estimate.poses[mask] - truth.at(estimate.stamps_ns[mask])
+    errors[:, 2] = wrap_angle(errors[:, 2])
+    return mask, errors
+
+
+def _pairs(truth: Trajectory, estimate: Trajectory) -> tuple[Array, Array]:
+    """Estimated and true positions (N, 2) m, where both exist."""
     mask = has_truth(truth, estimate.stamps_ns) & np.isfinite(estimate.poses[:, 0])
     return estimate.poses[mask, :2], truth.at(estimate.stamps_ns[mask])[:, :2]
 
@@ -329,15 +331,12 @@ def similarity(truth: Trajectory, estimate: Trajectory) -> dict[str, float | Non
     """`mean` error (m) after rotation, translation and `scale` are fitted on the estimate itself:
     the error without that of the wheels' radius and of the place of the map.
     """
-    estimated, true = _pairs((truth, estimate))
+    estimated, true = _pairs(truth, estimate)
     if len(estimated) < 2:
         return {'mean': None, 'scale': None}
-    aligned, center = align(estimated, true).apply(estimated), true.mean(0)
-    offset = aligned - aligned.mean(0)
-    square = float((offset**2).sum())
-    scale = float((offset * (true - center)).sum()) / square if square > 0 else 1.0
-    errors = np.hypot(*(scale * offset + center - true).T)
-    return {'mean': float(errors.mean()), 'scale': scale}
+    places, target = ((z - z.mean()) for z in (estimated @ [1.0, 1.0j], true @ [1.0, 1.0j]))
+    fit = np.vdot(places, target) / max(np.vdot(places, places).real, 1e-12)
+    return {'mean': float(np.abs(fit * places - target).mean()), 'scale': float(abs(fit))}
 
 
 def calibration(
@@ -352,18 +351,14 @@ def calibration(
 
     `covariances` (N, 3, 3) of [x, y, yaw] are in the map, which `turn` (2, 2) rotates to the truth.
     """
-    mask = has_truth(truth, estimate.stamps_ns)
+    mask, errors = _errors(truth, estimate)
     if not mask.any():
         return dict.fromkeys(('within_95', 'yaw_within_95', 'nees', 'nees_right'))
-    errors, covariances = (
-        estimate.poses[mask] - truth.at(estimate.stamps_ns[mask]),
-        covariances[mask],
-    )
-    roots = np.linalg.cholesky(covariances[:, :2, :2])
+    roots = np.linalg.cholesky(covariances[mask, :2, :2])
     normalized = np.linalg.solve(roots, (errors[:, :2] @ turn)[:, :, None])[:, :, 0]
     squares = (normalized**2).sum(1)
     freedom = 2 * _effective_count(normalized)
-    yaw = wrap_angle(errors[:, 2]) ** 2 / covariances[:, 2, 2]
+    yaw = errors[:, 2] ** 2 / covariances[mask, 2, 2]
     yaw = yaw[np.isfinite(yaw)]
     return {
         'within_95': float((squares <= stats.chi2.ppf(0.95, 2)).mean()),
@@ -386,11 +381,11 @@ def _effective_count(normalized: Array) -> float:
     return count / (1 + 2 * float(((shared[1:] / shared[0]) ** 2).sum())) if len(shared) else count
 
 
-def _false_localised_s(drive: _Localized, ekf: Trajectory) -> float:
+def _false_localised_s(truth: Trajectory, ekf: Trajectory, localised: Mask) -> float:
     """Seconds in which the filter said LOCALISED and its position error exceeded `WRONG_M`."""
-    errors = np.hypot(*(ekf.poses - drive.truth.at(ekf.stamps_ns))[:, :2].T)
-    wrong = drive.localised & has_truth(drive.truth, ekf.stamps_ns) & (errors > WRONG_M)
-    return float(_seconds_since_last(ekf.stamps_ns)[wrong].sum())
+    mask, errors = _errors(truth, ekf)
+    wrong = localised[mask] & (np.hypot(*errors[:, :2].T) > WRONG_M)
+    return float(_seconds_since_last(ekf.stamps_ns)[mask][wrong].sum())
 
 
 def moved(estimate: Trajectory, transform: RigidTransform) -> Trajectory:
@@ -416,9 +411,8 @@ def score(truth: Trajectory, estimate: Trajectory) -> dict[str, Any]:
     `yaw_deg` holds mean, median and p95 of the heading errors, None without headings. The numbers
     are None where the truth covers no estimate.
     """
-    mask = has_truth(truth, estimate.stamps_ns)
-    errors = estimate.poses[mask] - truth.at(estimate.stamps_ns[mask])
-    position, yaw = np.hypot(*errors[:, :2].T), np.degrees(np.abs(wrap_angle(errors[:, 2])))
+    _, errors = _errors(truth, estimate)
+    position, yaw = np.hypot(*errors[:, :2].T), np.degrees(np.abs(errors[:, 2]))
     yaw = yaw[np.isfinite(yaw)]
     if len(position) == 0:
         return {**dict.fromkeys(('mean', 'median', 'p95', 'rmse', 'max')), 'n': 0, 'yaw_deg': None}

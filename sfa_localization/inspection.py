@@ -22,7 +22,7 @@ from sfa_localization.bags import decoding
 from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S
 from sfa_localization.bags.motion_arrays import to_yaw_rate
 from sfa_localization.bags.reader import Bag
-from sfa_localization.bags.settings import BagConfig, TopicNames
+from sfa_localization.bags.settings import TopicNames
 from sfa_localization.bags.topic_stream import Stream, clock_offset
 from sfa_localization.camera import body, kinds
 from sfa_localization.camera.panorama import looks_like_panorama
@@ -54,6 +54,7 @@ SECTORS = 6
 # A drive needs directions, each with a share of the path, or the shape of the map is ambiguous, and
 # a covered share of the area, or the map is extrapolated over whole regions.
 MIN_DIRECTIONS, MIN_SHARE, MIN_COVERED = 3, 0.05, 0.65
+MOVED_M = 1.0  # a shorter drive covers no area
 MAX_WITHOUT_ODOMETRY = 0.1  # share of images; more means that the clocks differ
 MAX_GAP_S = 2.0  # longer pauses of a topic are reported
 EVEN, EVEN_SHARE = 3.0, 0.9  # a topic is periodic if this share of intervals is below 3 medians
@@ -124,16 +125,16 @@ class TopicReport:
         """Whether a periodic topic paused; others may be published on change only."""
         steps = np.diff(self.stamps_ns)
         even = len(steps) and np.mean(steps <= EVEN * np.median(steps)) >= EVEN_SHARE
-        return bool(even and self.largest_gap_s > max(MAX_GAP_S, 5 / max(self.rate_hz, 1e-9)))
+        return bool(even and self.largest_gap_s > max(MAX_GAP_S, 5 / self.rate_hz))
 
     def as_dict(self) -> dict[str, Any]:
-        stamps = self.stamps_ns.tolist()
+        first, last = self.stamps_ns[[0, -1]].tolist() if self.count else (None, None)
         return {
             'type': self.kind,
             'count': self.count,
             'recorded': self.recorded,
-            'first_stamp_ns': stamps[0] if stamps else None,
-            'last_stamp_ns': stamps[-1] if stamps else None,
+            'first_stamp_ns': first,
+            'last_stamp_ns': last,
             'rate_hz': round(self.rate_hz, 3),
             'largest_gap_s': round(self.largest_gap_s, 3),
             'problems': self.problems,
@@ -237,7 +238,6 @@ def inspect(
     *,
     topics: TopicNames | None = None,
     config: InspectionConfig | None = None,
-    bag_config: BagConfig | None = None,
     clockwise: bool = True,
     strict: bool = False,
 ) -> BagReport:
@@ -245,22 +245,23 @@ def inspect(
 
     Raises BagError when nothing in it can be read.
     """
-    topics, report = topics or TopicNames(), BagReport(str(path))
-    with Bag(path, strict=strict, config=bag_config) as bag:
+    topics, config = topics or TopicNames(), config or InspectionConfig()
+    report = BagReport(str(path))
+    with Bag(path, strict=strict) as bag:
         report.image_topic = _topic_of(bag, 'image', topics.image, report)
         report.odometry_topic = _topic_of(bag, 'odometry', topics.odometry, report)
         _Survey(bag, report, topics, clockwise).fill()
-        report.problems, report.notes = bag.problems, bag.recording.notes
+        report.problems = bag.problems
+        report.notes += bag.recording.notes
     report.notes += body.sentences(report.bodies)
-    if _single_route(report.places):
-        report.notes.append(ROUTE)
-    if path_length(report.places) >= 1.0 and not headings_differ(report.places):
-        report.notes.append(NO_LEVER_ARM)
+    if path_length(report.places) >= MOVED_M:
+        report.notes += [ROUTE] if is_route(report.places) else []
+        report.notes += [] if headings_differ(report.places) else [NO_LEVER_ARM]
     if report.lacks:
         report.lacks += report.motion.wrong if report.motion else []
         return report
-    report.of_drive = list(lacks_of_drives(report.drives, config or InspectionConfig()))
-    report.lacks = [*lacks(report, config or InspectionConfig()), *report.of_drive]
+    report.of_drive = list(lacks_of_drives(report.drives, config))
+    report.lacks = [*lacks(report, config), *report.of_drive]
     return report
 
 
@@ -293,42 +294,36 @@ class _Survey:
 
     def fill(self) -> None:
         """Read the bag, and fill the report."""
-        streams = [self._stream(name) for name in self._bag.topics]
-        for stream, stamp_ns, value in self._bag.read(streams):
+        streams = {name: self._stream(name) for name in self._bag.topics}
+        for stream, stamp_ns, value in self._bag.read(streams.values()):
             self._values[stream.topic].append((stamp_ns, value))
-        self._report.topics = [self._topic(stream) for stream in streams]
-        samples = self._report.samples
+        report, samples = self._report, self._report.samples
+        report.topics = [self._topic(stream) for stream in streams.values()]
         if samples:
             ((height, width), _), *_ = self._sizes.most_common(1)
             alike = [sample for sample in samples if sample.shape == samples[0].shape]
-            self._report.camera = kinds.CameraKind(*kinds.guess_geometry(alike), width, height)
-        for stream in streams:
-            if stream.topic == self._odometry and self._values[self._odometry]:
-                offsets = [self._by_clock_of(stream, other) for other in streams]
-                self._drive(stream)
-                if motion := self._report.motion:
-                    motion.corrected += [text for ahead_ns, text in offsets if ahead_ns]
-                    motion.notes += [text for ahead_ns, text in offsets if text and not ahead_ns]
-
-    def _by_clock_of(self, odometry: Stream, stream: Stream) -> tuple[int, str]:
-        """Stamp images and yaw rates by the clock of the odometry: see `clock_offset`."""
-        name = {self._image: 'images', self._imu: 'gyroscope'}.get(stream.topic, '')
-        ahead_ns, text = clock_offset(name, stream, odometry) if name else (0, '')
-        values = self._values[stream.topic]
-        self._values[stream.topic] = [(stamp_ns - ahead_ns, value) for stamp_ns, value in values]
-        return ahead_ns, text
+            report.camera = kinds.CameraKind(*kinds.guess_geometry(alike), width, height)
+        odometry = streams[self._odometry] if self._odometry else None
+        if odometry is None or not self._values[self._odometry]:
+            return
+        for name, topic in (('images', self._image), ('gyroscope', self._imu)):
+            if topic:
+                ahead_ns, text = clock_offset(name, streams[topic], odometry)
+                self._values[topic] = [(at - ahead_ns, value) for at, value in self._values[topic]]
+                report.notes += [text] if text else []
+        try:
+            self._drive(self._bag.to_odometry(odometry, self._values[self._odometry]))
+        except BagError as error:
+            report.lacks.append(str(error).removeprefix(f'{self._bag.path}: '))
 
     def _stream(self, name: str) -> Stream:
         if name == self._odometry:
             stream = self._bag.stream(self._report.odometry_topic, decoding.odometry_of)
             stream.required = False
             return stream
-        if name == self._image:
-            return self._bag.stream(name, self._take, required=False)
-        if name == self._imu:
-            return self._bag.stream(name, self._yaw_rate, required=False)
+        convert = {self._image: self._take, self._imu: self._yaw_rate}.get(name)
         # Other images are decoded to detect damage, and not kept.
-        return self._bag.stream(name, lambda _: None, required=False)
+        return self._bag.stream(name, convert or (lambda _: None), required=False)
 
     def _take(self, image: Image) -> tuple[float, NDArray[np.int8] | None, NDArray[np.int8] | None]:
         """Keep a sample of the images now and then.
@@ -377,14 +372,9 @@ class _Survey:
         if self._repeats > MAX_REPEATED * report.recorded:
             yield f'{self._repeats} of {report.recorded} images repeat the one before'
 
-    def _drive(self, stream: Stream) -> None:
+    def _drive(self, odometry: Odometry) -> None:
         """Fill in the path, the tilt, and the comparison with images and gyroscope."""
         report, camera = self._report, self._report.camera
-        try:
-            odometry = self._bag.to_odometry(stream, self._values[self._odometry])
-        except BagError as error:
-            report.lacks.append(str(error).removeprefix(f'{self._bag.path}: '))
-            return
         images = self._values.get(self._image, [])
         stamps = np.array([stamp for stamp, _ in images], np.int64)
         yaw = np.array([yaw for _, (yaw, *_) in images], float)
@@ -477,10 +467,9 @@ def directions(places: Array) -> int:
     return int((share >= MIN_SHARE).sum())
 
 
-def _single_route(places: Array) -> bool:
-    """Whether training will learn a route, not an area, from images at places (M, 3)."""
-    moved = len(places) > 1 and path_length(places) >= 1.0
-    return moved and is_single_route(places[:, 0] + 1j * places[:, 1], PIECE_LENGTH_M)
+def is_route(places: Array) -> bool:
+    """Whether training will learn a route, not an area, from images at places (M, >= 2)."""
+    return is_single_route(places[:, 0] + 1j * places[:, 1], PIECE_LENGTH_M)
 
 
 def headings_differ(places: Array) -> bool:
@@ -547,10 +536,10 @@ def lacks_of_drives(drives: Sequence[Array], config: InspectionConfig) -> Iterat
     used = sum(map(len, drives))
     if 0 < used < config.min_pictures:
         yield f'{used} images with odometry are few: drive until there are {config.min_pictures}'
-    if used and sum(map(path_length, drives)) < 1.0:
+    if used and sum(map(path_length, drives)) < MOVED_M:
         yield 'the robot did not move: drive it over the area'
-    areas = [places for places in drives if len(places) > 1 and path_length(places) >= 1.0]
-    if all(map(_single_route, areas)):
+    areas = [places for places in drives if path_length(places) >= MOVED_M]
+    if all(map(is_route, areas)):
         return
     covered = [hull_area(places) * covered_share(places, config.reach) for places in areas]
     yield from sparse_lanes(sum(covered) / max(map(hull_area, areas)), config.reach)
@@ -565,10 +554,10 @@ def lacks_together(reports: Sequence[BagReport], config: InspectionConfig) -> li
     """The reasons why bags are not enough to train one model on all of them."""
     names: dict[str, list[str]] = {}
     for report in reports:
-        every = [report.error.removeprefix(f'{report.path}: ')] if report.error else report.lacks
-        for lack in every:
-            names.setdefault(lack, []).extend([report.path] * (lack not in report.of_drive))
-    texts = [f'{", ".join(paths)}: {lack}' for lack, paths in names.items() if paths]
+        error = [report.error.removeprefix(f'{report.path}: ')] if report.error else []
+        for lack in error or [lack for lack in report.lacks if lack not in report.of_drive]:
+            names.setdefault(lack, []).append(report.path)
+    texts = [f'{", ".join(paths)}: {lack}' for lack, paths in names.items()]
     images = [(r, topic) for r in reports for topic in r.topics if topic.name == r.image_topic]
     for (first, one), (second, other) in combinations(images, 2):
         if one.count and np.array_equal(one.stamps_ns, other.stamps_ns):

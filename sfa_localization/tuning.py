@@ -77,8 +77,6 @@ def read_drive(
     usable = sum(not image.problem for image in observations)
     if usable < MIN_IMAGES:
         raise DataError(f'{bag}: {usable} images are too few to tune on: {MIN_IMAGES} at least')
-    if want_truth and run.ground_truth is None:
-        raise DataError(f'{bag}: the grid search needs ground truth; use the likelihood')
     return TuningDrive(run.odometry, observations, run.ground_truth, partial(filter_of, model))
 
 

@@ -25,11 +25,11 @@ from sfa_localization.bags.topic_stream import Item, Stream, clock_offset
 @pytest.mark.parametrize(
     ('topic', 'ahead_s', 'text'),
     [
-        (IMAGES, 37, 'images: stamped 37.0 s ahead of the odometry, by their reception (/p'),
+        (IMAGES, 37, 'images: stamped 37.0 s ahead of the odometry (/p'),
         (IMAGES, -3600.4, 'images: stamped 3600.4 s behind the odometry, by their reception:'),
-        (IMU, 18, 'gyroscope: stamped 18.0 s ahead of the odometry, by their reception (/imu in'),
+        (IMU, 18, 'gyroscope: stamped 18.0 s ahead of the odometry (/imu in'),
         (TRUTH, 7, 'ground truth: stamped 7.0 s ahead of the odometry'),
-        (ODOMETRY, 19, 'images: stamped 19.0 s behind the odometry, by their reception (/odom'),
+        (ODOMETRY, 19, 'images: stamped 19.0 s behind the odometry (/odom'),
         (IMAGES, 1, ''),  # turns show it
         (IMAGES, -7, 'delayed, or by another clock? not corrected'),
     ],

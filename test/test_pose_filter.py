@@ -174,7 +174,7 @@ def test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed(ahead
     assert fused.counts['odometry: used'] == len(drive.stamps_ns)
     assert drive.error(fused, -1)[0] < 0.1 and fused.status.level is Level.DEGRADED
     where = 'behind' if ahead_s < 0 else 'ahead of'
-    said = f'images are stamped {abs(ahead_s):.0f} s {where} the odometry'
+    said = f'images are stamped {abs(ahead_s):.1f} s {where} the odometry'
     assert any(said in reason for reason in fused.status.reasons)
     # Once the clocks agree, all is forgotten.
     fused.add_measurement(int(drive.stamps_ns[-1]) + 1, drive.poses[-1, :2], np.eye(2) * 1e-2)

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfa_localization.camera.video import ImageReader
 from sfa_localization.data.errors import BagError, LocalizationError
-from sfa_localization.data.events import CLOCK_JUMP_NS, CLOCK_RANGE_S, LEAP_SECONDS, whole_leap
+from sfa_localization.data.events import CLOCK_JUMP_NS, CLOCK_RANGE_S, clock_difference, whole_leap
 from sfa_localization.data.messages import NO_STAMP
 from sfa_localization.data.rejections import RejectionCounter
 from sfa_localization.data.run import Count
@@ -150,11 +150,8 @@ def clock_offset(name: str, stream: Stream, odometry: Stream) -> tuple[int, str]
     # If a bag holds no times of reception, stamps are ahead by the length of the drive.
     if abs(offset_ns) <= max(range_ns, spread, other_spread):
         return 0, ''
-    seconds, where = abs(offset_ns) * 1e-9, 'ahead of' if offset_ns > 0 else 'behind'
-    scale = LEAP_SECONDS.get(round(seconds), '')
-    if scale:
-        scale = f' ({stream.topic if offset_ns > 0 else odometry.topic} in {scale}?)'
-    text = f'{name}: stamped {seconds:.1f} s {where} the odometry, by their reception{scale}'
+    difference = clock_difference(offset_ns, stream.topic, odometry.topic)
+    text = f'{name}: {difference}, by their reception'
     if min(ahead, other) > -CLOCK_JUMP_NS and max(ahead, other) < range_ns:
         return 0, f'{text}: delayed, or by another clock? not corrected'
     return offset_ns, f'{text}: taken into account'

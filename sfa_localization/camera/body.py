@@ -37,9 +37,6 @@ class Body:
     end: float
     top: float
 
-    def __str__(self) -> str:
-        return f'from {self.start:.0f} to {self.end:.0f} degrees'
-
 
 def blind_sectors(bodies: Sequence[Body]) -> str:
     """The parameter of omnicam_node that hides those with all rows; '' for none."""
@@ -48,15 +45,17 @@ def blind_sectors(bodies: Sequence[Body]) -> str:
 
 
 def sentences(bodies: Sequence[Body]) -> list[str]:
-    """What hides the view, and the remedy, for the columns and for the lower parts of some."""
-    whole = [body for body in bodies if not body.top]
-    groups = [('the view', whole, f'set {blind_sectors(bodies)}')] if whole else []
-    groups += [(f'the lower {1 - b.top:.0%} of the view', [b], _MASK) for b in bodies if b.top]
-    return [
-        f'{part} {" and ".join(map(str, hidden))} (0: forward, 90: left) stays the same while the '
-        f'robot turns, so it shows the robot: {remedy}'
-        for part, hidden, remedy in groups
-    ]
+    """What hides the view, and the remedy."""
+    texts = []
+    for body in bodies:
+        part, remedy = 'the view', f'set {blind_sectors(bodies)}'
+        if body.top:
+            part, remedy = f'the lower {1 - body.top:.0%} of the view', _MASK
+        texts.append(
+            f'{part} from {body.start:.0f} to {body.end:.0f} degrees (0: forward, 90: left) stays '
+            f'the same while the robot turns, so it shows the robot: {remedy}'
+        )
+    return texts
 
 
 def bodies(textures: NDArray[np.int8], yaw: Array, sphere: Sphere) -> list[Body]:

@@ -28,6 +28,16 @@ def whole_leap(offset_ns: float) -> int:
     return seconds * 1_000_000_000 if abs(seconds) in LEAP_SECONDS else round(offset_ns)
 
 
+def clock_difference(ahead_ns: float, topic: str = 'images', odometry: str = 'odometry') -> str:
+    """How far a topic is stamped ahead of the odometry, and which of them may be in another time
+    scale, in words.
+    """
+    seconds, where = abs(ahead_ns) * 1e-9, 'ahead of' if ahead_ns > 0 else 'behind'
+    scale = LEAP_SECONDS.get(round(seconds))
+    reason = f' ({topic if ahead_ns > 0 else odometry} in {scale}?)' if scale else ''
+    return f'stamped {seconds:.1f} s {where} the odometry{reason}'
+
+
 def merge_by_stamp(odometry_ns: Stamps, images_ns: Stamps) -> Iterator[tuple[int, int, int]]:
     """Stamp, ODOMETRY or IMAGE, and index in its own stream, for stamps (N,) and (M,).
 

@@ -192,11 +192,6 @@ class ImageClock:
         if self._supposed:
             self._supposed[1].add_odometry(stamp_ns, yaw_rad)
 
-    def __str__(self) -> str:
-        seconds = self.offset_ns * 1e-9
-        where = 'ahead of' if seconds > 0 else 'behind'
-        return f'stamped {abs(seconds):.1f} s {where} the odometry; taken into account'
-
     def add_heading(
         self, stamp_ns: int, yaw_rad: float, odometry_ns: int
     ) -> CameraClockFinder | None:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.events import DELAY_LIMIT_NS
+from sfa_localization.data.events import DELAY_LIMIT_NS, clock_difference
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.odometry_steps import Paths
 from sfa_localization.data.rig import Quantity, Rig
@@ -240,7 +240,8 @@ class PoseFilter:
             finder = self._images.add_heading(int(stamp_ns), yaw_rad, odometry_ns)
             if finder is not None:
                 self._camera, self._expected_s = finder, 0.0
-                self.counts[f'images: {self._images}'] += 1
+                text = clock_difference(self._images.offset_ns)
+                self.counts[f'images: {text}; taken into account'] += 1
         self._camera.add_heading(int(stamp_ns) - self._images.offset_ns, yaw_rad)
 
     def expect(self, rig: Rig) -> None:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.events import LEAP_SECONDS
+from sfa_localization.data.events import clock_difference
 from sfa_localization.fusion.belief import Belief, Event
 from sfa_localization.fusion.history import History
 
@@ -105,10 +105,7 @@ class Timeline:
         count, ahead_ns = self._other_clock
         if count < FEW_AHEAD:
             return []
-        where = f'{abs(ahead_ns) * 1e-9:.0f} s {"ahead of" if ahead_ns > 0 else "behind"}'
-        scale = LEAP_SECONDS.get(round(abs(ahead_ns) * 1e-9), '')
-        scale = f' ({scale}?)' if scale else ''
-        return [f'images are stamped {where} the odometry{scale}: synchronize the clocks']
+        return [f'images are {clock_difference(ahead_ns)}: synchronize the clocks']
 
     def _notice_again(
         self, stamp_ns: int, newest_ns: int | None, history: History[Event, Belief]
