@@ -164,34 +164,31 @@ def following(sources: Sequence[Source]) -> str:
     """
     images = next((source for source in sources if source.name == IMAGES), None)
     others = [one for one in sources if one.name != IMAGES and 'turns' in one.sums]
-    if images is None:
+    if images is None or not others:
         return ''
-    best, least = -1, EXPLAINED
-    for number, source in enumerate(reversed(others)):
-        direct, models = compare(source, images), _followers(source)
-        if direct is None or not direct.correlation < 1:
+    models = _FOLLOWERS
+    for source in reversed(others):
+        direct = compare(source, images)
+        if direct is None:
             return ''
-        pairs = [compare(model, images) for model in (models[best:][:1] if number else models)]
-        left = [1 - pair.correlation**2 if pair else 1.0 for pair in pairs]
-        if min(left) > least * (1 - direct.correlation**2):
-            return ''
-        best = best if number else int(np.argmin(left))
+        pairs = [compare(shown, images) for shown in _followers(source, models)]
+        explained = np.array([pair.correlation**2 if pair else 0.0 for pair in pairs])
+        best = int(explained.argmax())
+        models, pair = models[best : best + 1], pairs[best]
         # Wheels with bursts of slip look smoothed before and after; no camera turns in advance.
-        pair = pairs[0 if number else best]
-        if others[-1].name != GYRO and pair and (pair.delay_s or 0.0) < -LATE_S:
+        early = others[-1].name != GYRO and pair and (pair.delay_s or 0.0) < -LATE_S
+        if early or not 1 - explained[best] < EXPLAINED * (1 - direct.correlation**2):
             return ''
-    if best < 0:
-        return ''
-    lag_s, fastest, ignored = _FOLLOWERS[best].tolist()
+    lag_s, fastest, ignored = models[0].tolist()
     how = [f'with a lag of {lag_s:g} s'] if lag_s else []
     how += [f'at {fastest:g} rad/s at most'] if np.isfinite(fastest) else []
     how += [f'beyond {np.rad2deg(ignored):.0f} degrees only'] if ignored else []
     return ' and '.join(how)
 
 
-def _followers(source: Source) -> list[Source]:
-    """What cameras show that follow the turns of a source by each model of _FOLLOWERS."""
-    lag_s, fastest, ignored = _FOLLOWERS.T
+def _followers(source: Source, models: Array) -> list[Source]:
+    """What cameras show that follow the turns of a source by each of the models (K, 3)."""
+    lag_s, fastest, ignored = models.T
     with np.errstate(divide='ignore'):
         share = -np.expm1(-_STEP_S / lag_s)
     span_s = float(source.stamps_ns[-1] - source.stamps_ns[0]) * 1e-9
