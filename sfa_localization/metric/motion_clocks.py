@@ -17,6 +17,7 @@ from sfa_localization.data.statistics import MEDIAN_TO_STD, parabola_peak
 from sfa_localization.metric.motion_sources import (
     ALIKE,
     EQUAL,
+    FAR,
     GRID,
     GYRO,
     IMAGES,
@@ -34,13 +35,13 @@ EXPLAINED = 0.5
 best delay leaves: 0.02 to 0.5 for lags of 0.3 s and more, at least 0.9 for right drives."""
 PART_RAD, CHANCE = 2.5, 1e-4
 """Turn of a part of the drive, whose delay is fitted on its own (in smaller ones, images at 3 Hz
-show it within 0.1 s only), and the probability of a line by chance: 4e-4 in 320 right drives."""
+show it within 0.1 s only), and the probability of a line by chance: none of 320 right drives has
+such a line that matters."""
 RATE_MAX = 0.02
 """Clocks of cameras are up to 1 % fast."""
 # In fewer windows any delay fits; more parts take long.
 _WINDOWS_MIN, _PARTS_MIN, _PARTS_MAX, _ROUNDS = 4, 4, 100, 4
 _STEP_S = 0.05
-_OUTLIER = 3.0  # times the typical turn, or standard deviations
 _EXACT_S = 1e-3
 # Models of a camera that follows: lag, s, largest rate, rad/s, and turn that it ignores, rad.
 _FOLLOWERS = np.array(
@@ -90,7 +91,7 @@ def drift(a: Source, b: Source) -> Drift | None:
         late_ns = np.round((delay_s + rate * seconds) * 1e9).astype(np.int64)
         more_s, alike = _delays(turns, fast, windows_ns + late_ns[:, None], first)
         error = np.abs(more_s)
-        near = alike & (error <= _OUTLIER * MEDIAN_TO_STD * np.median(error) + _EXACT_S)
+        near = alike & (error <= FAR * MEDIAN_TO_STD * np.median(error) + _EXACT_S)
         if near.sum() < _PARTS_MIN:
             return None
         line = linregress(at_s[near], (delay_s + rate * at_s + more_s)[near])
@@ -115,7 +116,7 @@ def _delays(turns: Array, other: Source, windows_ns: Stamps, first: Indices) -> 
     """Of parts that begin with the `first` (K,) of M windows: the delays (K,) s of another source
     at which its turns are most like `turns` (M,) rad, and whether they are alike then.
     """
-    limit = _OUTLIER * typical(turns)
+    limit = FAR * typical(turns)
     delays_ns = np.round(GRID * 1e9).astype(np.int64)[:, None, None]
     moved = np.clip(other.moved(windows_ns + delays_ns, 'turns'), -limit, limit)
     turns = np.clip(turns, -limit, limit)
