@@ -9,14 +9,15 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from scipy.stats import linregress, theilslopes
 
-from sfa_localization.data.geometry import Array, Mask
+from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.run import Stamps
-from sfa_localization.data.statistics import MEDIAN_TO_STD, outlier_factor, surprise
-from sfa_localization.metric.motion_samples import OUTLIER
+from sfa_localization.data.statistics import MEDIAN_TO_STD, parabola_peak
 from sfa_localization.metric.motion_sources import (
-    ENOUGH,
+    ALIKE,
     EQUAL,
+    FAR,
     GRID,
     GYRO,
     IMAGES,
@@ -32,24 +33,21 @@ from sfa_localization.metric.motion_sources import (
 EXPLAINED = 0.5
 """A camera follows the robot if a model of this leaves at most this share of the variance that the
 best delay leaves: 0.02 to 0.5 for lags of 0.3 s and more, at least 0.9 for right drives."""
-_RATE_STD = 0.005
-"""Of the rates of clocks that drift: those of cameras are up to 1 % fast."""
-_BEGIN_S = 50.0
-"""Time before and after the middle of the turns in which a drift is fitted first: a clock that is
-1 % fast gains less than a turn lasts."""
-_STEADY = 1e-9  # of the rate of a clock that does not drift
-_PARTS, _ROUNDS, _SETTLED = 12, 20, 1e-5
-_STEP_S, _SLIGHT_RAD = 0.05, 1e-3
-_REACH = 0.3, _RATE_STD  # of one step: the largest change of the delay, s, and of its rate
+PART_RAD, CHANCE = 2.5, 1e-4
+"""Turn of a part of the drive, whose delay is fitted on its own (in smaller ones, images at 3 Hz
+show it within 0.1 s only), and the probability of a line by chance: none of 320 right drives has
+such a line that matters."""
+RATE_MAX = 0.02
+"""Clocks of cameras are up to 1 % fast."""
+# In fewer windows any delay fits; more parts take long.
+_WINDOWS_MIN, _PARTS_MIN, _PARTS_MAX, _ROUNDS = 4, 4, 100, 4
+_STEP_S = 0.05
+_EXACT_S = 1e-3
 # Models of a camera that follows: lag, s, largest rate, rad/s, and turn that it ignores, rad.
 _FOLLOWERS = np.array(
     [*product((0.0, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0), (np.inf, 0.4, 0.2), (0.0,))][1:]
     + [(0.0, np.inf, ignored) for ignored in (0.1, 0.2, 0.4, 0.8)]
 )
-
-
-Fit = tuple[float, float, float]
-"""Scale, delay, s, and rate of a delay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,120 +71,62 @@ def drift(a: Source, b: Source) -> Drift | None:
     """How the clock of `b` drifts against that of `a`, by their turns; None where nothing shows a
     drift, or it matters less than a delay of LATE_S.
 
-    It is fitted where the sources are most alike, and then to more and more windows, which it leads
-    near the right delay. Its standard deviation is that of fits that leave out parts of the drive.
+    A line is fitted to the delays of the parts of the drive, by least squares of those that are
+    near the line of Theil and Sen.
     """
     chosen = in_windows(a, b, 'turns')
     if chosen is None:
         return None
     slow, fast, windows_ns = chosen
-    sign = 1 if slow is a else -1
-    every = _Turns(fast, windows_ns, slow.moved(windows_ns, 'turns'), windows_ns[0, 0])
-    if not every.turned[-1] >= ENOUGH['turns']:  # also turns that are unknown
+    turns, seconds = slow.moved(windows_ns, 'turns'), (windows_ns[:, 0] - windows_ns[0, 0]) * 1e-9
+    if not np.abs(turns).sum() >= _PARTS_MIN * PART_RAD:  # also turns that are unknown
         return None
-    part = (_PARTS * every.turned / every.turned[-1]).astype(int).clip(0, _PARTS - 1)
-    centers_ns = [every.windows_ns[part >= k][0, 0] for k in range(_PARTS)]
-    begins = [replace(every, at_ns=at_ns).within(_BEGIN_S).begin() for at_ns in centers_ns]
-    best = max(range(_PARTS), key=lambda k: begins[k][1])
-    every, (fit, _), radius_s = replace(every, at_ns=centers_ns[best]), begins[best], _BEGIN_S
-    while radius_s < 2 * float(np.abs(every.seconds).max()):
-        fit = every.within(radius_s).fitted(fit)
-        radius_s *= 2
-    rates = [every.where(part != k).fitted(fit)[2] for k in range(_PARTS)]
-    std = float(np.sqrt(np.mean((np.array(rates) - fit[2]) ** 2) * (_PARTS - 1)))
-    delay_s, rate = sign * fit[1], sign * fit[2]
-    certain = abs(rate) > OUTLIER * std and every.better(fit) > OUTLIER**2 / 2
-    if not certain or abs(rate) * np.ptp(every.seconds) < LATE_S:
+    first = _parts(turns)
+    at_s = np.add.reduceat(np.abs(turns) * seconds, first) / np.add.reduceat(np.abs(turns), first)
+    more_s, near = _delays(turns, fast, windows_ns, first)
+    if near.sum() < _PARTS_MIN:
         return None
-    at_ns = int(every.at_ns)
-    if slow is a:  # fitted over the time of `a`
-        at_ns, rate = at_ns + round(delay_s * 1e9), rate / (1 + rate)
-    return Drift(at_ns, delay_s, rate)
+    rate, delay_s, *_ = theilslopes(more_s[near], at_s[near])
+    for _ in range(_ROUNDS):  # the line leads to delays beyond the grid
+        late_ns = np.round((delay_s + rate * seconds) * 1e9).astype(np.int64)
+        more_s, alike = _delays(turns, fast, windows_ns + late_ns[:, None], first)
+        error = np.abs(more_s)
+        near = alike & (error <= FAR * MEDIAN_TO_STD * np.median(error) + _EXACT_S)
+        if near.sum() < _PARTS_MIN:
+            return None
+        line = linregress(at_s[near], (delay_s + rate * at_s + more_s)[near])
+        rate, delay_s = float(line.slope), float(line.intercept)
+    if line.pvalue > CHANCE or not LATE_S / seconds[-1] < abs(rate) < RATE_MAX:
+        return None
+    at_ns = int(windows_ns[0, 0])
+    if slow is a:  # the line is over the time of `a`
+        return Drift(at_ns + round(delay_s * 1e9), delay_s, rate / (1 + rate))
+    return Drift(at_ns, -delay_s, -rate)
 
 
-@dataclass(frozen=True, slots=True)
-class _Turns:
-    """`turns` (M,) rad of one source in windows (M, 2) ns, and the `other` source, which is late by
-    a line: a delay, s, at a stamp, and a rate.
+def _parts(turns: Array) -> Indices:
+    """The first windows (K,) of parts of a drive that turn equally far, by the turns (M,) rad."""
+    turned = np.cumsum(np.abs(turns))
+    count = min(turned[-1] // PART_RAD, _PARTS_MAX)
+    first = np.unique(np.ceil(turned / turned[-1] * count).clip(1), return_index=True)[1]
+    return np.asarray(first[np.diff(first, prepend=-_WINDOWS_MIN) >= _WINDOWS_MIN])
+
+
+def _delays(turns: Array, other: Source, windows_ns: Stamps, first: Indices) -> tuple[Array, Mask]:
+    """Of parts that begin with the `first` (K,) of M windows: the delays (K,) s of another source
+    at which its turns are most like `turns` (M,) rad, and whether they are alike then.
     """
-
-    other: Source
-    windows_ns: Stamps
-    turns: Array
-    at_ns: int
-    rate_std: float = _RATE_STD
-
-    @property
-    def seconds(self) -> Array:
-        """(M,) from the stamp to each window."""
-        return np.asarray((self.windows_ns[:, 0] - self.at_ns) * 1e-9)
-
-    @property
-    def turned(self) -> Array:
-        """Turns (M,) up to each window, in either direction."""
-        return np.cumsum(np.abs(self.turns))
-
-    def where(self, chosen: Mask) -> _Turns:
-        """The chosen (M,) windows."""
-        return replace(self, windows_ns=self.windows_ns[chosen], turns=self.turns[chosen])
-
-    def within(self, radius_s: float) -> _Turns:
-        """The windows so near to the stamp."""
-        return self.where(np.abs(self.seconds) <= radius_s)
-
-    def begin(self) -> tuple[Fit, float]:
-        """The best constant delay, and the sum of the squared turns that it explains."""
-        limit = 3 * typical(self.turns)
-        shifted = np.array([self._shifted(delay_s, 0.0) for delay_s in GRID.tolist()])
-        product_sum, power = (
-            shifted @ np.clip(self.turns, -limit, limit),
-            (shifted**2).sum(1) + 1e-9,
-        )
-        explained = product_sum**2 / power
-        best = int(np.argmax(explained))
-        return (float(product_sum[best] / power[best]), float(GRID[best]), 0.0), explained[best]
-
-    def fitted(self, fit: Fit) -> Fit:
-        """Scale, delay and rate by least squares without outliers, from near ones."""
-        for _ in range(_ROUNDS):
-            before, fit = fit, self._step(*fit)
-            if np.allclose(fit, before, rtol=0.0, atol=_SETTLED):
-                break
-        return fit
-
-    def _step(self, scale: float, delay_s: float, rate: float) -> Fit:
-        """Scale, delay and rate after a step of Gauss and Newton."""
-        turned = self._shifted(delay_s, rate)
-        later, sooner = (self._shifted(delay_s + by, rate) for by in (_STEP_S, -_STEP_S))
-        slope = (later - sooner) / (2 * _STEP_S)
-        error = self.turns - scale * turned
-        std = self._std(error)
-        weight = 1 / (outlier_factor((error / std) ** 2) * std**2)
-        design = np.column_stack([turned, slope, slope * self.seconds])
-        prior = np.diag([0.0, 0.0, 1 / (self.rate_std * max(abs(scale), 0.1)) ** 2])
-        normal = (design.T * weight) @ design + prior + 1e-9 * np.eye(3)
-        scale, *change = np.linalg.solve(normal, design.T @ (weight * self.turns)).tolist()
-        size = np.copysign(max(abs(scale), 0.1), scale)
-        step_s, step = np.clip(np.divide(change, size), *np.outer((-1, 1), _REACH)).tolist()
-        return scale, delay_s + step_s, rate + step
-
-    def _std(self, error: Array) -> float:
-        """Standard deviation, rad, of the errors (M,) of turns that stand out."""
-        moving = np.abs(self.turns) >= typical(self.turns) / 4
-        return MEDIAN_TO_STD * float(np.median(np.abs(error[moving]))) + _SLIGHT_RAD
-
-    def better(self, fit: Fit) -> float:
-        """Logarithm of the ratio of likelihoods of a fit and of the best constant delay."""
-        scale, *steady = replace(self, rate_std=_STEADY).fitted((fit[0], fit[1], 0.0))
-        errors = [self.turns - k * self._shifted(*line) for k, *line in ((scale, *steady), fit)]
-        std = self._std(errors[1])
-        constant, drifting = (surprise((error / std) ** 2, 1).sum() for error in errors)
-        return float(constant - drifting)
-
-    def _shifted(self, delay_s: float, rate: float) -> Array:
-        """Turns (M,) of the other source in the windows, later by the line."""
-        late_ns = np.round((delay_s + rate * self.seconds) * 1e9).astype(np.int64)
-        return self.other.moved(self.windows_ns + late_ns[:, None], 'turns')
+    limit = FAR * typical(turns)
+    delays_ns = np.round(GRID * 1e9).astype(np.int64)[:, None, None]
+    moved = np.clip(other.moved(windows_ns + delays_ns, 'turns'), -limit, limit)
+    turns = np.clip(turns, -limit, limit)
+    product, power, own_power = (
+        np.add.reduceat(x, first, axis=-1) for x in (moved * turns, moved**2, turns**2)
+    )
+    correlation = np.abs(product) / np.sqrt(power * own_power + 1e-12)
+    rows, best = np.arange(len(first)), correlation.argmax(0).clip(1, len(GRID) - 2)
+    peak = parabola_peak(*(correlation[best + by, rows] for by in (-1, 0, 1)))
+    return GRID[best] + peak * (GRID[1] - GRID[0]), correlation[best, rows] > ALIKE
 
 
 def drifts(sources: Sequence[Source]) -> dict[str, Drift]:
@@ -225,34 +165,31 @@ def following(sources: Sequence[Source]) -> str:
     """
     images = next((source for source in sources if source.name == IMAGES), None)
     others = [one for one in sources if one.name != IMAGES and 'turns' in one.sums]
-    if images is None:
+    if images is None or not others:
         return ''
-    best, least = -1, EXPLAINED
-    for number, source in enumerate(reversed(others)):
-        direct, models = compare(source, images), _followers(source)
-        if direct is None or not direct.correlation < 1:
+    models = _FOLLOWERS
+    for source in reversed(others):
+        direct = compare(source, images)
+        if direct is None:
             return ''
-        pairs = [compare(model, images) for model in (models[best:][:1] if number else models)]
-        left = [1 - pair.correlation**2 if pair else 1.0 for pair in pairs]
-        if min(left) > least * (1 - direct.correlation**2):
-            return ''
-        best = best if number else int(np.argmin(left))
+        pairs = [compare(shown, images) for shown in _followers(source, models)]
+        explained = np.array([pair.correlation**2 if pair else 0.0 for pair in pairs])
+        best = int(explained.argmax())
+        models, pair = models[best : best + 1], pairs[best]
         # Wheels with bursts of slip look smoothed before and after; no camera turns in advance.
-        pair = pairs[0 if number else best]
-        if others[-1].name != GYRO and pair and (pair.delay_s or 0.0) < -LATE_S:
+        early = others[-1].name != GYRO and pair and (pair.delay_s or 0.0) < -LATE_S
+        if early or not 1 - explained[best] < EXPLAINED * (1 - direct.correlation**2):
             return ''
-    if best < 0:
-        return ''
-    lag_s, fastest, ignored = _FOLLOWERS[best].tolist()
+    lag_s, fastest, ignored = models[0].tolist()
     how = [f'with a lag of {lag_s:g} s'] if lag_s else []
     how += [f'at {fastest:g} rad/s at most'] if np.isfinite(fastest) else []
     how += [f'beyond {np.rad2deg(ignored):.0f} degrees only'] if ignored else []
     return ' and '.join(how)
 
 
-def _followers(source: Source) -> list[Source]:
-    """What cameras show that follow the turns of a source by each model of _FOLLOWERS."""
-    lag_s, fastest, ignored = _FOLLOWERS.T
+def _followers(source: Source, models: Array) -> list[Source]:
+    """What cameras show that follow the turns of a source by each of the models (K, 3)."""
+    lag_s, fastest, ignored = models.T
     with np.errstate(divide='ignore'):
         share = -np.expm1(-_STEP_S / lag_s)
     span_s = float(source.stamps_ns[-1] - source.stamps_ns[0]) * 1e-9

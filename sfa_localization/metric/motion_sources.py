@@ -39,10 +39,12 @@ LATE_S = 0.05
 """Smaller delays are within the period of usual messages."""
 GRID = np.arange(-50, 51) * (CLOCK_RANGE_S / 50)
 """Delays, s."""
+FAR = 3.0
+"""Steps beyond so many times the typical one are clipped, and errors beyond so many standard
+deviations take no part."""
 # Windows are lengthened until half of the motion is in windows with _STEP (rad, m) or more.
 _WINDOWS_S, _STEP, _WINDOWS_MAX = 0.19 * 2.0 ** np.arange(4), 0.1, 3000
 _PAUSE_S = 1.0
-_OUTLIER = 3.0  # times the typical step
 # A delay is certain if the delays that fit nearly as well scatter by less than this, s.
 _STD_MAX_S = 0.06
 # Distance, m, over which maps and odometry are compared: many times the error of one image.
@@ -228,7 +230,7 @@ def _regressed(what: str, a: Source, b: Source, x: Array, y: Array) -> Pair | No
     limit = np.array([typical(x[middle]), typical(y[middle])])
     # Shifts between images may err by any angle.
     limit = np.minimum(limit, 2 * limit[::-1]) if IMAGES in (a.name, b.name) else limit
-    u, v = (np.clip(s, -_OUTLIER * q, _OUTLIER * q) for s, q in zip((x, y), limit, strict=True))
+    u, v = (np.clip(s, -FAR * q, FAR * q) for s, q in zip((x, y), limit, strict=True))
     inlier = np.ones(x.shape[1], bool)
     for _ in range(2):
         power = (u[:, inlier] ** 2).sum(1) * (v[:, inlier] ** 2).sum(1)
@@ -239,7 +241,7 @@ def _regressed(what: str, a: Source, b: Source, x: Array, y: Array) -> Pair | No
         scale = quantile(ratio[inlier], 0.5, np.abs(x[best, inlier]))
         residual, moves = np.abs(y[best] - scale * x[best]), np.abs(u[best]) > limit[0] / 4
         std = MEDIAN_TO_STD * float(np.median(residual[moves])) if moves.any() else np.inf
-        inlier = residual <= max(_OUTLIER * std, limit[1] / 2)
+        inlier = residual <= max(FAR * std, limit[1] / 2)
     # Delays whose correlation is within one standard deviation of the best.
     chance = (1 - correlation[best] ** 2) / np.sqrt(max(moves.sum(), 1))
     as_good = GRID[correlation >= correlation[best] - chance - 1e-3]

@@ -14,7 +14,8 @@ distribution. Estimates that are judged take no part.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,6 @@ WHEELS_STD = 0.05
 _SAMPLES, _STEP_S = 4000, 0.2
 _PRIOR_STD = np.array([1.0, 1.0, 1.0, 0.1])
 """Of theta: lever arm ahead and to the left, m, delay, s, and logarithm of the scale."""
-_LEVER, _DELAY = [0, 1], [2]
 _STEP, _CLOSE, _ROUNDS = 0.05, 1e-4, 12  # of theta
 _UNITS = {1.0: '', 100.0: 'centimeters', 1000.0: 'millimeters'}
 
@@ -221,26 +221,18 @@ class _Comparison:
         return plain
 
     def settled(self, fit: _Fit, free: Mask) -> _Fit:
-        """The fit with a delay and a lever arm only where they are certain, and matter."""
-        limits = (_LEVER, LEVER_MIN_M), (_DELAY, LATE_S)
-        rows, about_s = np.arange(len(self.seconds)), float(fit.theta[2])
-
-        def refitted(theta: Array, free: Mask) -> _Fit | None:
-            return self.fitted(fit.mirrored, theta, free, rows, about_s)
-
-        fit = refitted(fit.theta, free) or fit
-        for _ in limits:
-            fewer = []
-            for values, least in limits:
-                chosen = (fit.theta != 0) & ~np.isin(np.arange(4), values)
-                if not fit.theta[values].any():
-                    continue
-                without = refitted(fit.theta * chosen, chosen)
-                small = np.linalg.norm(fit.theta[values]) < least
-                if small or (without and without.cost(fit.std) - fit.cost(fit.std) < CERTAIN):
-                    fewer.append(without or replace(fit, theta=fit.theta * chosen))
-            fit = min(fewer, key=lambda fit: fit.cost(FAULT_M), default=fit)
-        return fit
+        """The fit with a delay and a lever arm only where they matter, and each gains CERTAIN."""
+        rows, about_s, fits = np.arange(len(self.seconds)), float(fit.theta[2]), []
+        for lever, delay in product((True, False), repeat=2):
+            chosen = free & [lever, lever, delay, True]
+            other = self.fitted(fit.mirrored, fit.theta * chosen, chosen, rows, about_s)
+            if other is None:
+                continue
+            x, y, late_s, _ = np.abs(other.theta)
+            if np.hypot(x, y) >= LEVER_MIN_M * lever and late_s >= LATE_S * delay:
+                fits.append((other, CERTAIN * (lever + delay)))
+        std = min((other.std for other, _ in fits), default=NOISE_M)
+        return min(fits, key=lambda item: item[0].cost(std) + item[1], default=(fit, 0.0))[0]
 
     def agreed(self, free: Mask) -> _Fit | None:
         """The best fit without faulty samples, which are no longer `used`; None without enough
