@@ -25,7 +25,7 @@ from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
 from sfa_localization.metric.breaks import StampedTextures, contradicted, parted
 from sfa_localization.metric.motion_clocks import Drift, drift_sentences, drifts, following
-from sfa_localization.metric.motion_gyro import cleaned, is_worse
+from sfa_localization.metric.motion_gyro import cleaned
 from sfa_localization.metric.motion_sources import (
     ENOUGH,
     EQUAL,
@@ -179,7 +179,7 @@ def check_motion(
         _judge_axes(check)
         _judge_following(check, sources, commands)
         _judge(check, 'turns')
-        _judge_clocks(check, images)
+        _judge_clocks(check)
         if views is not None:
             clock = check.image_drift or Drift(0, turns.late_s if turns else 0.0, 0.0)
             taken_ns = views[0] - clock.late_ns(views[0])
@@ -265,7 +265,7 @@ def _repaired(
     check: MotionCheck, images: tuple[Stamps, Array] | None
 ) -> tuple[Stamps, Array] | None:
     """Correct odometry that jumps or heads aside; stamp the images, and `check.gyro`, by its clock
-    where theirs drifts; leave out faulty samples of the gyroscope.
+    where theirs drifts; leave out faulty samples of the gyroscope, or all of them.
     """
     for change in parted, _straightened:
         check.odometry, text = change(check.odometry)
@@ -380,10 +380,8 @@ def _correct_gyro(check: MotionCheck, kind: str, text: str, factor: float) -> No
         check.gyro = None
 
 
-def _judge_clocks(check: MotionCheck, images: tuple[Stamps, Array] | None) -> None:
-    """Correct the stamps of the gyroscope, and leave out one that is worse than none even then; the
-    training corrects the stamps of images.
-    """
+def _judge_clocks(check: MotionCheck) -> None:
+    """Correct the stamps of the gyroscope; the training corrects those of images."""
     if check.gyro is not None and not check.odometry.trajectory.covers(check.gyro.stamps_ns).any():
         check.corrected.append(f'{GYRO}: stamped by another clock than the odometry; left out')
         check.gyro = None
@@ -397,6 +395,3 @@ def _judge_clocks(check: MotionCheck, images: tuple[Stamps, Array] | None) -> No
         if name == GYRO and check.gyro is not None:
             check.gyro = replace(check.gyro, stamps_ns=check.gyro.stamps_ns - late_ns)
         check.corrected.append(f'{name}: stamped {late(pair.late_s)}; taken into account')
-    if is_worse(check.odometry, images, check.gyro):
-        check.corrected.append(f'{GYRO}: left out: the wheels agree better with the images')
-        check.gyro = None

@@ -37,13 +37,14 @@ WORSE = 2.0
 of right ones, 1.3 with noise of 0.05 rad/s, 7 of one with half of its rates 0, in three drives."""
 _SURE = OUTLIER**2 / 2  # log-likelihood ratio of a residual of OUTLIER standard deviations
 _SHIFTS = 9
+_UNITS = 1.0, 180 / np.pi  # rad/s and degrees/s
 
 
 def cleaned(
     odometry: Odometry, images: tuple[Stamps, Array] | None, gyro: YawRate | None
 ) -> tuple[YawRate | None, str]:
-    """The gyroscope without samples that contradict wheels and images, and a sentence on them; ''
-    for none.
+    """The gyroscope without samples that contradict wheels and images, or None if it is worse than
+    the wheels even then; and a sentence, '' for none.
     """
     if gyro is None:
         return None, ''
@@ -53,11 +54,18 @@ def cleaned(
     if not compared:
         return gyro, ''
     (wheels, _), (rates, factor), (views, scale) = compared
-    if not any(1 / EQUAL < abs(factor) / unit < EQUAL for unit in (1.0, 180 / np.pi)):
-        return gyro, ''  # not only single samples are faulty
-    beyond = _beyond(wheels, rates.stamps_ns, gyro.omega / factor)
-    mask = _guilty(rates.stamps_ns, beyond, views.stamps_ns, *_between(wheels, views, scale))
+    unit = np.copysign(min(_UNITS, key=lambda unit: abs(np.log(abs(factor) / unit))), factor)
+    mask = np.zeros(len(gyro.omega), bool)
+    if 1 / EQUAL < factor / unit < EQUAL:  # else not only single samples are faulty
+        beyond = _beyond(wheels, rates.stamps_ns, gyro.omega / factor)
+        turns = _between(wheels, views, scale)
+        mask = _guilty(rates.stamps_ns, beyond, views.stamps_ns, *turns)
     kept = YawRate(gyro.stamps_ns[~mask], gyro.omega[~mask], gyro.variance[~mask])
+    at_ns = rates.stamps_ns[~mask]
+    *_, rates = sources_of(odometry, None, replace(kept, stamps_ns=at_ns, omega=kept.omega / unit))
+    if _is_worse(rates, wheels, views, float(np.sign(scale))):
+        far = f'it turns {abs(factor):.3g} times as far as these'
+        return None, f'{GYRO}: left out: the wheels agree better with the images; {far}'
     return kept, fault_sentence(GYRO, mask, gyro.stamps_ns, 'wheels and images')
 
 
@@ -127,16 +135,11 @@ def _between(wheels: Source, views: Source, scale: float) -> tuple[Array, Array]
     return turned, wrap_angle(np.diff(views.sums['turns']) - scale * turned) / scale
 
 
-def is_worse(odometry: Odometry, images: tuple[Stamps, Array] | None, gyro: YawRate | None) -> bool:
+def _is_worse(rates: Source, wheels: Source, views: Source, sign: float) -> bool:
     """Whether the turns between images agree with the wheels, and not with the gyroscope without
     its bias: by the mean error.
     """
-    compared = _compared(odometry, images, gyro)
-    if not compared:
-        return False
-    (wheels, _), (rates, _), (views, scale) = compared
-    _, by_wheels = _between(wheels, views, np.sign(scale))
-    _, by_gyro = _between(rates, views, np.sign(scale))
+    (_, by_gyro), (_, by_wheels) = (_between(one, views, sign) for one in (rates, wheels))
     at = views.stamps_ns
     whole = without_pause(at[:-1], at[1:], rates.stamps_ns, GAP_MAX_S) & (np.diff(at) > 0)
     if not whole.any():
