@@ -44,8 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('gardens', type=Path, metavar='GARDENS', help='folder or YAML list of them')
     parser.add_argument('--output', type=Path, required=True, metavar='MODELS')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write all results as JSON')
-    parser.add_argument('--workers', type=int, default=cores, help='processes here [all cores]')
-    parser.add_argument('--scheduler', metavar='tcp://HOST:8786', help='work on a Dask cluster')
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument('--workers', type=int, default=cores, help='processes here [all cores]')
+    place.add_argument('--scheduler', metavar='tcp://HOST:8786', help='work on a Dask cluster')
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -56,6 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError('--workers: give 1 or more')
     output, address = arguments.output.resolve(), arguments.scheduler
     options.require_report(output, arguments.json)
+    if arguments.json:
+        options.require_output(arguments.json, [], '.json')
     gardens = _gardens(arguments.gardens, output)
     changed = [garden for garden in gardens if not is_up_to_date(garden)]
     try:
@@ -75,18 +78,22 @@ def _gardens(source: Path, output: Path) -> list[Garden]:
     from sfa_localization.commands.garden import Garden
 
     if source.is_dir():
-        folders = [path.resolve() for path in sorted(source.iterdir()) if path.is_dir()]
+        inside = (path for path in sorted(source.iterdir()) if path.name[0] != '.')
+        folders = [path.resolve() for path in inside if path.is_dir()]
     else:
         try:
             listed = load_yaml(read_text(source, LONGEST, ConfigError))
-            folders = [(source.parent / name).resolve() for name in listed]
-        except (ValueError, TypeError) as error:
-            raise ConfigError(f'{source}: no list such as "- /bags/garden_1": {error}') from None
-    names = Counter(folder.name for folder in [*folders, *({output} & {*folders})])
-    twice = [name for name, count in names.items() if count > 1]
-    if twice or not folders:
-        problem = f'two folders are named {twice[0]}' if twice else 'holds no folder'
+        except ValueError as error:
+            raise ConfigError(f'{source}: {error}') from None
+        if not isinstance(listed, list):
+            raise ConfigError(f'{source}: must be a list, with lines such as "- /bags/garden_1"')
+        folders = [(source.parent / str(name)).resolve() for name in listed]
+    repeated = [name for name, n in Counter(folder.name for folder in folders).items() if n > 1]
+    if repeated or not folders:
+        problem = f'two folders are named {repeated[0]}' if repeated else 'holds no folder'
         raise ConfigError(f'{source}: {problem}: name a folder for each garden')
+    if output in folders or output.parent == source.resolve():
+        raise ConfigError(f'{output}: lies among the gardens: give --output another place')
     return [Garden(folder, output / folder.name) for folder in folders]
 
 
@@ -136,7 +143,7 @@ def _work_on(gardens: Sequence[Garden], places: Places, total: int) -> None:
             while waiting and len(running) < limit():
                 garden, executor = waiting.popleft(), start()
                 running[executor.submit(work, garden)] = garden, executor
-            bar.set_description_str(f'running {len(running)}, refused {refused}')
+            bar.set_description_str(f'running {len(running)}, refused {refused}', refresh=False)
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 garden, executor = running.pop(future)
                 if future.cancelled():

@@ -12,8 +12,7 @@ from urllib.parse import quote
 
 from sfa_localization.reports import page
 
-_ORDER = ('refused', 'waiting', 'weak', 'good')
-_CLASSES = {'refused': page.BAD, 'weak': page.WEAK, 'good': page.GOOD}
+_GRADES = {'refused': page.BAD, 'waiting': '', 'weak': page.WEAK, 'good': page.GOOD}
 _COLUMNS = ('garden', 'state', 'what was found', 'expected error (m)', 'test error (m)',
             'area (m2)', 'age (days)', 'change (m)', 'work (s)')  # fmt: skip
 _NOTES = (
@@ -21,33 +20,31 @@ _NOTES = (
     'drives. Change: of the expected error since the training before.'
 )
 _SCRIPT = """
-<style>body { max-width: none; } td:nth-child(3) { text-align: left; min-width: 20rem; }
-th { cursor: pointer; } td { vertical-align: top; }</style>
-<script>
+<style>body { max-width: none; } th { cursor: pointer; } td { vertical-align: top; }
+th:nth-child(-n+3), td:nth-child(-n+3) { text-align: left; } td:nth-child(3) { min-width: 20rem; }
+</style><script>
 const body = document.querySelector('tbody'), rows = [...body.rows];
 document.querySelector('thead').onclick = ({target}) => {
-  const values = new Map(rows.map(row => [row, row.cells[target.cellIndex].dataset.value]));
-  const up = target.dataset.up = target.dataset.up === '1' ? '-1' : '1';
-  rows.sort((a, b) => up * values.get(a).localeCompare(values.get(b), 'en', {numeric: true}));
+  const value = row => row.cells[target.cellIndex].dataset.value;
+  const order = target.dataset.order = -(target.dataset.order || -1);
+  rows.sort((a, b) => order * (value(a) - value(b) || value(a).localeCompare(value(b))));
   body.append(...rows);
 };
-document.querySelector('input').oninput = ({target}) => {
-  for (const row of rows)
-    row.hidden = !row.textContent.toLowerCase().includes(target.value.toLowerCase());
-};
+document.querySelector('input').oninput = ({target}) => rows.forEach(row => {
+  row.hidden = !row.textContent.toLowerCase().includes(target.value.toLowerCase());
+});
 </script>"""
 
 
 def write_fleet_page(folder: Path, results: Sequence[Mapping[str, Any]], now_s: float) -> None:
-    """Write `folder`/index.html from the results of gardens; `now_s` is the Unix time.
+    """Write `folder`/index.html about the results of gardens at a Unix time (s).
 
     Raises LocalizationError.
     """
-    ordered = sorted(results, key=lambda result: (_ORDER.index(result['state']), -_error(result)))
-    head = ''.join(f'<th>{escape(title)}</th>' for title in _COLUMNS)
-    body = ''.join(_row(result, now_s) for result in ordered)
     states = [result['state'] for result in results]
-    counts = ', '.join(f'{states.count(state)} {state}' for state in _ORDER if state in states)
+    counts = ', '.join(f'{states.count(state)} {state}' for state in _GRADES if state in states)
+    body = ''.join(_row(result, now_s) for result in sorted(results, key=_badness))
+    head = ''.join(f'<th>{escape(title)}</th>' for title in _COLUMNS)
     page.write_page(
         folder,
         f'{len(results)} gardens: {counts}',
@@ -57,8 +54,10 @@ def write_fleet_page(folder: Path, results: Sequence[Mapping[str, Any]], now_s: 
     )
 
 
-def _error(result: Mapping[str, Any]) -> float:
-    return float((result.get('model') or {}).get('expected_error_m', 0.0))
+def _badness(result: Mapping[str, Any]) -> tuple[int, float]:
+    """The place of a garden in the order of the page."""
+    error_m = (result.get('model') or {}).get('expected_error_m', 0.0)
+    return [*_GRADES].index(result['state']), -error_m
 
 
 def _row(result: Mapping[str, Any], now_s: float) -> str:
@@ -76,9 +75,12 @@ def _row(result: Mapping[str, Any], now_s: float) -> str:
     )
     name, file, state = result['garden'], result.get('page'), result['state']
     link = f'<a href="{quote(f"{name}/{file}")}">{escape(name)}</a>' if file else escape(name)
-    sentences = [f'{about}: {text}' for about, _, text in result.get('judgments', ())]
-    cells = [(name, link), (str(_ORDER.index(state)), state)]
-    cells.append((' '.join(sentences), '<br>'.join(map(escape, sentences))))
+    sentences = [f'{about}: {text}' for about, _, text in result['judgments']]
+    cells = [
+        (name, link),
+        (state, state),
+        (' '.join(sentences), '<br>'.join(map(escape, sentences))),
+    ]
     cells += [('', '-') if x is None else (f'{x:.3f}', format(x, form)) for x, form in numbers]
     columns = ''.join(f'<td data-value="{escape(value)}">{text}</td>' for value, text in cells)
-    return f'<tr class="{_CLASSES.get(state, "")}">{columns}</tr>\n'
+    return f'<tr class="{_GRADES[state]}">{columns}</tr>\n'
