@@ -67,6 +67,15 @@ def test_a_process_that_dies_loses_only_its_garden_and_what_is_done_is_not_done_
     assert text.index('>b<') < text.index('>e<') < text.index('>a<') and '2 good' in text
 
 
+def test_a_cluster_works_by_the_same_rules(gardens):
+    distributed = pytest.importorskip('distributed')
+    one = {'n_workers': 1, 'threads_per_worker': 1, 'dashboard_address': None}
+    with distributed.LocalCluster(processes=False, **one) as cluster:
+        code, results = gardens('--scheduler', cluster.scheduler_address, a='good', b='fails')
+    assert (code, results['a']['state'], results['b']['state']) == (1, 'good', 'refused')
+    assert [len(gardens.tries(name)) for name in 'ab'] == [1, 2]
+
+
 def test_ctrl_c_ends_the_processes_and_leaves_a_page(gardens, monkeypatch):
     monkeypatch.setattr(fleet, 'wait', lambda *_, **__: os.kill(os.getpid(), signal.SIGINT))
     code, results = gardens('--workers', '1', a='good', b='good')
