@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+from unittest import mock
 
 import pytest
 from cylinder_worlds import SMALL_RECIPE, write_bag
@@ -77,7 +78,7 @@ def test_a_cluster_works_by_the_same_rules(gardens):
 
 
 def test_ctrl_c_ends_the_processes_and_leaves_a_page(gardens, monkeypatch):
-    monkeypatch.setattr(fleet, 'wait', lambda *_, **__: os.kill(os.getpid(), signal.SIGINT))
+    monkeypatch.setattr(fleet, 'wait', mock.Mock(side_effect=KeyboardInterrupt))
     code, results = gardens('--workers', '1', a='good', b='good')
     assert code == 130 and results['b']['state'] == 'waiting' and '>b<' in gardens.page.read_text()
     assert all(child.join(60) is None for child in fleet.multiprocessing.active_children())
