@@ -15,6 +15,7 @@ COMMANDS = (
     'simulate',
     'train',
     'evaluate',
+    'fleet',
     'play',
     'inspect',
     'calibrate',
@@ -77,6 +78,8 @@ setup(
         'video': ['av>=16.0'],
         # The reference engine of `train`, made of MDP's nodes.
         'mdp': ['MDP==3.6'],
+        # The workers of `fleet` on several machines.
+        'fleet': ['dask>=2024.1', 'distributed>=2024.1'],
         # colcon finds the test runner by this name.
         'test': ['pytest>=7.4', 'hypothesis>=6.82', 'psutil>=5.9'],
         'dev': ['ruff==0.17.5', 'mypy==2.4.1', 'types-PyYAML', 'pytest-xdist>=3.3'],

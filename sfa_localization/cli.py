@@ -23,6 +23,7 @@ COMMANDS = {
     'train': 'Learn a place model from bags of images and odometry; ground truth is never read.',
     'evaluate': 'Compare a model, alone and fused with odometry, with the ground truth of a drive.',
     'play': 'Replay a bag through ROS, with the types, QoS and pace of the recording.',
+    'fleet': 'Train, update and evaluate the models of many gardens, each in its own process.',
     'inspect': 'Report the contents and defects of bags, and whether they are enough to train on.',
     'map': 'Write where the robot drove in training as a map for Nav2.',
     'calibrate': 'Detect the mirror in images, or read a calibration file; write parameters.',
@@ -38,6 +39,7 @@ OPTIONAL = {
     'embreex': 'trimesh embreex',
     'mdp': 'MDP==3.6',
     'mcap': 'mcap',
+    'distributed': 'dask distributed',
     'threadpoolctl': 'threadpoolctl, or: sudo apt install python3-threadpoolctl',
     'rclpy': '"ros-jazzy-rclpy[fastrtps]" ros-jazzy-common-interfaces, or source ROS 2',
 }

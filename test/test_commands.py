@@ -6,6 +6,8 @@ import contextlib
 import io
 import shutil
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -16,6 +18,7 @@ from test_calibration import scene
 
 from sfa_localization import cli, training, tuning
 from sfa_localization.bags.reader import Bag
+from sfa_localization.commands import fleet
 from sfa_localization.data.errors import DataError, NodeError
 from sfa_localization.simulation import drive as simulation
 
@@ -35,6 +38,7 @@ BASE = {
     'tune': '{data}/test --model {data}/model.npz --output {out}/out.yaml',
     'map': '{data}/model.npz --output {out}/garden.yaml',
     'config': '',
+    'fleet': '{data}/gardens --output {out}/models',
     'demo': '--out {out}/demo',
     # For these options something else.
     'simulate --trajectory': '{out}/bag --area 6x6 --images panorama --size 32x8 --images-every 10',
@@ -86,6 +90,7 @@ CASES = {
         --odom-topic /ground_truth; --imu-topic /nothing => /nothing
         --ground-truth-topic /nothing --method grid => /nothing""",
     'config': '--output {out}/out.yaml',
+    'fleet': '--output {out}/others; --json {out}/all.json; --workers 7; --scheduler tcp://a:1',
     'demo': '--out {out}/elsewhere; --world 3',
 }
 """The options, and what a command prints only with one; if nothing is named, the texts, files or
@@ -110,6 +115,13 @@ class Outcome(NamedTuple):
     notes: list
 
 
+@contextlib.contextmanager
+def threads(notes, place):
+    """In the place of processes and clusters."""
+    notes.append(place)
+    yield lambda: ThreadPoolExecutor(1), lambda: 1
+
+
 def watch(name, notes, patch):
     """Note what no output shows; minutes of work of `demo`, and the replay, are left out."""
     train = training.train
@@ -124,6 +136,8 @@ def watch(name, notes, patch):
     patch.setattr(training, 'train', trained)
     patch.setattr(tuning, 'TRIALS', 10)
     patch.setattr(tuning, 'FACTORS', (0.5, 2.0))
+    for place in ('_processes', '_cluster'):
+        patch.setattr(fleet, place, partial(threads, notes))
     if name not in ('play', 'demo'):
         return
     from sfa_localization.commands import bag_player, live_nodes
@@ -187,6 +201,7 @@ def data(tmp_path_factory, gardens, small_network):
         name, _, words = command.partition(' ')
         made = run(name, words, folder)
         assert made.code == 0, made.text
+    (folder / 'gardens' / 'empty').mkdir(parents=True)
     shutil.copytree(folder / 'bag', folder / 'cut')
     (file,) = (folder / 'cut').glob('*.mcap')
     file.write_bytes(file.read_bytes()[: int(0.9 * file.stat().st_size)])

@@ -65,7 +65,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
         CORE
         | {'config', 'place_model', 'localizer', 'training', 'evaluation', 'tuning', 'inspection'}
         | {'updating', 'filtering', 'simulation', 'reports', 'nodes', '__init__'},
-        {'numpy', 'rosbags'} | ROS,
+        {'numpy', 'rosbags', 'distributed'} | ROS,
     ),
     'cli': ({'data', 'commands', 'nodes', '__init__'}, set()),
 }
@@ -154,6 +154,11 @@ def test_modules_import_only_what_their_rooms_may():
 
 LONGEST_FUNCTION, TYPICAL_FUNCTION = 40, 8
 """Lines, with signature and docstring: the most that one has, and the most that the median has."""
+
+
+def test_a_cluster_is_for_the_fleet_alone():
+    dask = [m for m in MODULES if external(m) & {'dask', 'distributed'}]
+    assert dask == [f'{NAME}.commands.fleet']
 
 
 def test_functions_are_short():

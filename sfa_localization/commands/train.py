@@ -73,7 +73,10 @@ def run(arguments: argparse.Namespace) -> int:
     )
     print(summary(trained))
     if arguments.report:
-        _write_report(arguments.report, arguments.bags, trained, used)
+        from sfa_localization.reports.page import PAGE
+
+        write_report(arguments.report, arguments.bags, trained, used)
+        print(f'{arguments.report / PAGE}: written')
     print(written)
     return 0
 
@@ -106,10 +109,13 @@ def _update(arguments: argparse.Namespace, written: str) -> int:
     return 0
 
 
-def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Recipe) -> None:
-    """Write figures and the page; the worst images are read from the bags again."""
+def write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Recipe) -> None:
+    """Write figures and the page; the worst images are read from the bags again.
+
+    Raises LocalizationError.
+    """
     from sfa_localization.bags.drives import images_at
-    from sfa_localization.reports.page import PAGE, begin_page
+    from sfa_localization.reports.page import begin_page
     from sfa_localization.reports.training import worst_of, write_training_report
 
     worst = worst_of(trained)
@@ -120,4 +126,3 @@ def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Re
     samples = {image: read[run][at] for image, (run, at) in worst.items() if at in read[run]}
     begin_page(folder)
     write_training_report(folder, trained, samples)
-    print(f'{folder / PAGE}: written')

@@ -1,0 +1,184 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Many gardens: each in its own process, what is left is the state, and a page tells of all."""
+
+import json
+import os
+import re
+import shutil
+import signal
+from unittest import mock
+
+import pytest
+from cylinder_worlds import SMALL_RECIPE, write_bag
+
+from sfa_localization import cli
+from sfa_localization.commands import fleet, garden, options
+from sfa_localization.commands.garden import Garden, is_up_to_date
+from sfa_localization.reports.fleet import write_fleet_page
+
+
+def pretended(place):
+    """The work on a garden whose file `script` says what happens; a garden writes its pid."""
+    script, tries = (place.folder / 'script').read_text(), place.folder / 'tries'
+    with open(tries, 'a') as file:
+        file.write(f'{os.getpid()}\n')
+    if script == 'dies' or (script == 'dies once' and len(tries.read_text().split()) == 1):
+        os.kill(os.getpid(), signal.SIGKILL)
+    if script == 'fails':
+        raise ValueError('a fault\nof two lines')
+    grade = 'bad' if script == 'refuses' else 'good'
+    return place.write([('training', grade, script)], model=None, inputs=place.inputs([]))
+
+
+@pytest.fixture
+def gardens(tmp_path, monkeypatch):
+    """A folder of gardens with a script each; `run()` returns exit code and results by name."""
+    monkeypatch.setattr(garden, 'work', pretended)
+
+    def run(*words, **scripts):
+        for name, script in scripts.items():
+            (tmp_path / 'gardens' / name).mkdir(parents=True, exist_ok=True)
+            (tmp_path / 'gardens' / name / 'script').write_text(script)
+        file, output = tmp_path / 'all.json', tmp_path / 'models'
+        named = [str(tmp_path / 'gardens'), '--output', str(output), '--json', str(file)]
+        code = cli.main(['fleet', *named, *words])
+        return code, {row['garden']: row for row in json.loads(file.read_text())['gardens']}
+
+    run.tries = lambda name: (tmp_path / 'gardens' / name / 'tries').read_text().split()
+    run.page = tmp_path / 'models/index.html'
+    return run
+
+
+def test_a_process_that_dies_loses_only_its_garden_and_what_is_done_is_not_done_again(
+    gardens, capsys
+):
+    code, results = gardens('--workers', '2', a='good', b='dies', c='dies once', e='refuses')
+    states = {name: row['state'] for name, row in results.items()}
+    assert states == dict.fromkeys('ac', 'good') | dict.fromkeys('be', 'refused') and code == 1
+    assert [len(set(gardens.tries(name))) for name in 'abce'] == [1, 2, 2, 1]
+    assert len({pid for name in 'abce' for pid in gardens.tries(name)}) == 6, 'a process each'
+    told = capsys.readouterr()
+    assert 'b: refused: ' in told.out and 'BrokenProcessPool' in told.out
+
+    code, results = gardens('--workers', '1', b='fails')
+    assert [len(gardens.tries(name)) for name in 'abce'] == [1, 4, 2, 1] and code == 1
+    assert 'ValueError: a fault of two lines' in results['b']['sentence']
+    text = gardens.page.read_text()
+    assert text.index('>b<') < text.index('>e<') < text.index('>a<') and '2 good' in text
+
+
+def test_a_cluster_works_by_the_same_rules(gardens):
+    distributed = pytest.importorskip('distributed')
+    one = {'n_workers': 1, 'threads_per_worker': 1, 'dashboard_address': None}
+    with distributed.LocalCluster(processes=False, **one) as cluster:
+        code, results = gardens('--scheduler', cluster.scheduler_address, a='good', b='fails')
+    assert (code, results['a']['state'], results['b']['state']) == (1, 'good', 'refused')
+    assert [len(gardens.tries(name)) for name in 'ab'] == [1, 2]
+
+
+def test_ctrl_c_ends_the_processes_and_leaves_a_page(gardens, monkeypatch):
+    monkeypatch.setattr(fleet, 'wait', mock.Mock(side_effect=KeyboardInterrupt))
+    code, results = gardens('--workers', '1', a='good', b='good')
+    assert code == 130 and results['b']['state'] == 'waiting' and '>b<' in gardens.page.read_text()
+    assert all(child.join(60) is None for child in fleet.multiprocessing.active_children())
+
+
+@pytest.fixture
+def place(trained, tmp_path, monkeypatch):
+    """A garden with the small drive, learned by the small recipe."""
+    monkeypatch.setattr(options, 'recipe', lambda arguments: SMALL_RECIPE)
+    shutil.copytree(trained.bag, tmp_path / 'bags' / trained.bag.name)
+    return Garden(tmp_path / 'bags', tmp_path / 'models' / 'one')
+
+
+def sentences(result):
+    return {about: (grade, text) for about, grade, text in result['judgments']}
+
+
+def test_a_garden_is_trained_as_by_train_then_updated_and_never_loses_its_model(place, trained):
+    shutil.copytree(trained.bag, place.folder / 'test' / 'again')
+    assert not is_up_to_date(place)
+    state = garden.work(place)
+    first, data = place.result(), place.model.read_bytes()
+    assert data == trained.model.read_bytes() and is_up_to_date(place)
+    assert first['state'] == state and (place.output / first['page']).is_file()
+    told = sentences(first)
+    assert '160 images with odometry are few' in told['inspection'][1]
+    assert told['test again'][0] == 'good' and 'has no true poses' in told['test again'][1]
+
+    write_bag(place.folder / 'later', seed=3)
+    assert not is_up_to_date(place)
+    garden.work(place)
+    told, later = sentences(place.result()), place.result()
+    assert told['update'][0] == 'good' and 'later' in told['update'][1]
+    assert told['training'] == sentences(first)['training'] and is_up_to_date(place)
+    assert later['model']['trained_s'] == first['model']['trained_s'] != 0
+
+    data = place.model.read_bytes()
+    shutil.rmtree(place.folder / 'drive')
+    (place.folder / 'later' / 'later.mcap').write_bytes(b'nothing')
+    assert garden.work(place) == 'refused' and place.model.read_bytes() == data
+    assert sentences(place.result())['training'] == sentences(first)['training']
+    assert place.result()['model'] == later['model'] and is_up_to_date(place)
+
+
+def test_a_drive_that_an_update_cannot_use_is_named_and_the_model_stays(place, monkeypatch):
+    garden.work(place)
+    data = place.model.read_bytes()
+    write_bag(place.folder / 'later', seed=3)
+    (place.folder / 'later' / 'later.mcap').write_bytes(b'nothing')
+    assert garden.work(place) == 'weak' and place.model.read_bytes() == data
+    assert 'later.mcap' in sentences(place.result())['update'][1] and is_up_to_date(place)
+
+
+def test_a_training_that_was_interrupted_with_other_bags_starts_anew(place, trained):
+    checkpoint = place.output / '.model.npz.checkpoint.npz'
+    checkpoint.parent.mkdir(parents=True)
+    shutil.copy(trained.model, checkpoint)
+    garden.work(place)
+    assert place.model.read_bytes() == trained.model.read_bytes() and not checkpoint.exists()
+
+
+def test_files_of_the_garden_are_its_options(tmp_path):
+    (tmp_path / 'localization.yaml').write_text('training: {ros__parameters: {slow_features: 5}}')
+    (tmp_path / 'points.csv').write_text('')
+    recipe = garden._settings(Garden(tmp_path, tmp_path / 'out'))['recipe']
+    assert recipe.metric.slow_features == 5 and recipe.metric.points == f'{tmp_path}/points.csv'
+    (tmp_path / 'localization.yaml').write_text('training: {ros__parameters: {slow: 5}}')
+    assert garden.work(Garden(tmp_path, tmp_path / 'out')) == 'refused'
+
+
+@pytest.mark.parametrize(('text', 'words'), [
+    ('a: 1', 'must be a list'), ('', 'must be a list'), ('[', 'is not YAML'),
+    ('[a/x, b/x]', 'two folders are named x'), ('[]', 'holds no folder'),
+    ('[models]', 'lies among the gardens'),
+])  # fmt: skip
+def test_a_bad_list_of_gardens_is_an_error(text, words, tmp_path, capsys):
+    (tmp_path / 'gardens.yaml').write_text(text)
+    listed, models = str(tmp_path / 'gardens.yaml'), tmp_path / 'models'
+    assert cli.main(['fleet', listed, '--output', str(models)]) == 1
+    assert words in capsys.readouterr().err and not models.exists()
+
+
+def test_the_page_is_in_order_escaped_and_needs_no_other_file(tmp_path):
+    model = {'expected_error_m': 0.1, 'previous_error_m': 0.3, 'area_m2': 50.4, 'trained_s': 0.0}
+    rows = [
+        {'garden': 'good', 'state': 'good', 'judgments': [('training', 'good', 'The map is good')],
+         'model': model, 'errors_m': {'x': 0.04, 'y': None}, 'page': 'training/index.html'},
+        {'garden': 'a<b & c', 'state': 'refused', 'judgments': [('run', 'bad', 'no <bag>')],
+         'page': 'inspection/index.html'},
+        {'garden': 'weak', 'state': 'weak', 'judgments': [],
+         'model': {**model, 'expected_error_m': 0.8}},
+        {'garden': 'weaker', 'state': 'weak', 'judgments': [],
+         'model': {**model, 'expected_error_m': 0.9}},
+    ]  # fmt: skip
+    write_fleet_page(tmp_path, rows, 2 * 86400.0)
+    text = (tmp_path / 'index.html').read_text()
+    cells = [re.findall('<td[^>]*>(.*?)</td>', row) for row in re.findall('<tr.*?</tr>', text)[1:]]
+    names = [re.sub('<.*?>', '', row[0]) for row in cells]
+    assert names == ['a&lt;b &amp; c', 'weaker', 'weak', 'good']
+    assert cells[0][2] == 'run: no &lt;bag&gt;' and set(cells[0][3:]) == {'-'}
+    assert cells[3][3:] == ['0.10', '0.04', '50', '2.0', '-0.20', '-']
+    assert 'href="a%3Cb%20%26%20c/inspection/index.html"' in text
+    assert '1 refused, 2 weak, 1 good' in text and not re.search('src=|<link|http', text)
