@@ -59,6 +59,7 @@ CASES = {
         --speed-noise 0.5; --gyro-bias 0.05; --gyro-noise 0.1""",
     'train': """
         --output {out}/other.npz; --config {data}/fewer.yaml; --report {out}/report; --resume
+        --json {out}/judgment.json
         --update {data}/model.npz => the model; --strict => read without --strict
         --force => written; --image-topic /nothing => /nothing; --odom-topic /ground_truth
         --imu-topic /nothing => /nothing; --points-topic /nothing => /nothing
@@ -119,7 +120,7 @@ class Outcome(NamedTuple):
 def threads(notes, place):
     """In the place of processes and clusters."""
     notes.append(place)
-    yield lambda: ThreadPoolExecutor(1), lambda: 1
+    yield ThreadPoolExecutor(1).submit, lambda: 1
 
 
 def watch(name, notes, patch):

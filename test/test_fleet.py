@@ -14,13 +14,13 @@ from cylinder_worlds import SMALL_RECIPE, write_bag
 
 from sfa_localization import cli
 from sfa_localization.commands import fleet, garden, options
-from sfa_localization.commands.garden import Garden, is_up_to_date
+from sfa_localization.commands.garden import Garden
 from sfa_localization.reports.fleet import write_fleet_page
 
 
 def pretended(place):
     """The work on a garden whose file `script` says what happens; a garden writes its pid."""
-    script, tries = (place.folder / 'script').read_text(), place.folder / 'tries'
+    script, tries = (place.folder / 'script').read_text(), place.folder / '.tries'
     with open(tries, 'a') as file:
         file.write(f'{os.getpid()}\n')
     if script == 'dies' or (script == 'dies once' and len(tries.read_text().split()) == 1):
@@ -28,7 +28,9 @@ def pretended(place):
     if script == 'fails':
         raise ValueError('a fault\nof two lines')
     grade = 'bad' if script == 'refuses' else 'good'
-    return place.write([('training', grade, script)], model=None, inputs=place.inputs([]))
+    place.model.parent.mkdir(parents=True, exist_ok=True)
+    place.model.touch()
+    return place.write({'inputs': place.inputs()}, [{'grade': grade, 'sentence': script}])
 
 
 @pytest.fixture
@@ -45,7 +47,7 @@ def gardens(tmp_path, monkeypatch):
         code = cli.main(['fleet', *named, *words])
         return code, {row['garden']: row for row in json.loads(file.read_text())['gardens']}
 
-    run.tries = lambda name: (tmp_path / 'gardens' / name / 'tries').read_text().split()
+    run.tries = lambda name: (tmp_path / 'gardens' / name / '.tries').read_text().split()
     run.page = tmp_path / 'models/index.html'
     return run
 
@@ -63,7 +65,7 @@ def test_a_process_that_dies_loses_only_its_garden_and_what_is_done_is_not_done_
 
     code, results = gardens('--workers', '1', b='fails')
     assert [len(gardens.tries(name)) for name in 'abce'] == [1, 4, 2, 1] and code == 1
-    assert 'ValueError: a fault of two lines' in results['b']['sentence']
+    assert 'ValueError: a fault of two lines' in results['b']['sentences'][0]
     text = gardens.page.read_text()
     assert text.index('>b<') < text.index('>e<') < text.index('>a<') and '2 good' in text
 
@@ -80,7 +82,7 @@ def test_a_cluster_works_by_the_same_rules(gardens):
 def test_ctrl_c_ends_the_processes_and_leaves_a_page(gardens, monkeypatch):
     monkeypatch.setattr(fleet, 'wait', mock.Mock(side_effect=KeyboardInterrupt))
     code, results = gardens('--workers', '1', a='good', b='good')
-    assert code == 130 and results['b']['state'] == 'waiting' and '>b<' in gardens.page.read_text()
+    assert code == 130 and results == {} and '0 of 2 gardens' in gardens.page.read_text()
     assert all(child.join(60) is None for child in fleet.multiprocessing.active_children())
 
 
@@ -92,35 +94,30 @@ def place(trained, tmp_path, monkeypatch):
     return Garden(tmp_path / 'bags', tmp_path / 'models' / 'one')
 
 
-def sentences(result):
-    return {about: (grade, text) for about, grade, text in result['judgments']}
-
-
 def test_a_garden_is_trained_as_by_train_then_updated_and_never_loses_its_model(place, trained):
     shutil.copytree(trained.bag, place.folder / 'test' / 'again')
-    assert not is_up_to_date(place)
+    assert not place.is_up_to_date()
     state = garden.work(place)
     first, data = place.result(), place.model.read_bytes()
-    assert data == trained.model.read_bytes() and is_up_to_date(place)
-    assert first['state'] == state and (place.output / first['page']).is_file()
-    told = sentences(first)
-    assert '160 images with odometry are few' in told['inspection'][1]
-    assert told['test again'][0] == 'good' and 'has no true poses' in told['test again'][1]
+    assert data == trained.model.read_bytes() and place.is_up_to_date()
+    assert first['state'] == state == 'weak' and 'has no true poses' in first['sentences'][0]
+    assert (place.output / 'training/index.html').is_file()
 
+    shutil.rmtree(place.folder / 'test')
     write_bag(place.folder / 'later', seed=3)
-    assert not is_up_to_date(place)
+    assert not place.is_up_to_date()
     garden.work(place)
-    told, later = sentences(place.result()), place.result()
-    assert told['update'][0] == 'good' and 'later' in told['update'][1]
-    assert told['training'] == sentences(first)['training'] and is_up_to_date(place)
-    assert later['model']['trained_s'] == first['model']['trained_s'] != 0
+    later = place.result()
+    assert 'later: ' in later['sentences'][1] and place.is_up_to_date()
+    assert later['sentences'][0] == first['sentences'][1]
+    assert later['trained_s'] == first['trained_s'] != 0 and later['change_m'] == 0
 
     data = place.model.read_bytes()
     shutil.rmtree(place.folder / 'drive')
     (place.folder / 'later' / 'later.mcap').write_bytes(b'nothing')
     assert garden.work(place) == 'refused' and place.model.read_bytes() == data
-    assert sentences(place.result())['training'] == sentences(first)['training']
-    assert place.result()['model'] == later['model'] and is_up_to_date(place)
+    assert place.is_up_to_date()
+    assert place.result()['expected_error_m'] == later['expected_error_m']
 
 
 def test_a_drive_that_an_update_cannot_use_is_named_and_the_model_stays(place, monkeypatch):
@@ -129,7 +126,7 @@ def test_a_drive_that_an_update_cannot_use_is_named_and_the_model_stays(place, m
     write_bag(place.folder / 'later', seed=3)
     (place.folder / 'later' / 'later.mcap').write_bytes(b'nothing')
     assert garden.work(place) == 'weak' and place.model.read_bytes() == data
-    assert 'later.mcap' in sentences(place.result())['update'][1] and is_up_to_date(place)
+    assert 'later.mcap' in place.result()['sentences'][0] and place.is_up_to_date()
 
 
 def test_a_training_that_was_interrupted_with_other_bags_starts_anew(place, trained):
@@ -140,19 +137,20 @@ def test_a_training_that_was_interrupted_with_other_bags_starts_anew(place, trai
     assert place.model.read_bytes() == trained.model.read_bytes() and not checkpoint.exists()
 
 
-def test_files_of_the_garden_are_its_options(tmp_path):
-    (tmp_path / 'localization.yaml').write_text('training: {ros__parameters: {slow_features: 5}}')
-    (tmp_path / 'points.csv').write_text('')
-    recipe = garden._settings(Garden(tmp_path, tmp_path / 'out'))['recipe']
-    assert recipe.metric.slow_features == 5 and recipe.metric.points == f'{tmp_path}/points.csv'
-    (tmp_path / 'localization.yaml').write_text('training: {ros__parameters: {slow: 5}}')
-    assert garden.work(Garden(tmp_path, tmp_path / 'out')) == 'refused'
+def test_files_of_the_garden_are_its_options(trained, tmp_path):
+    place = Garden(tmp_path / 'bags', tmp_path / 'models')
+    shutil.copytree(trained.bag, place.folder / 'drive')
+    (place.folder / 'points.csv').write_text('nothing')
+    assert garden.work(place) == 'refused' and 'points.csv' in place.result()['sentences'][0]
+    config = place.folder / 'localization.yaml'
+    config.write_text('training: {ros__parameters: {slow: 5}}')
+    assert not place.is_up_to_date() and garden.work(place) == 'refused'
+    assert str(config) in place.result()['sentences'][0]
 
 
 @pytest.mark.parametrize(('text', 'words'), [
     ('a: 1', 'must be a list'), ('', 'must be a list'), ('[', 'is not YAML'),
-    ('[a/x, b/x]', 'two folders are named x'), ('[]', 'holds no folder'),
-    ('[models]', 'lies among the gardens'),
+    ('[a/x, b/x]', 'each with another name'), ('[models]', 'at least one folder'),
 ])  # fmt: skip
 def test_a_bad_list_of_gardens_is_an_error(text, words, tmp_path, capsys):
     (tmp_path / 'gardens.yaml').write_text(text)
@@ -162,23 +160,22 @@ def test_a_bad_list_of_gardens_is_an_error(text, words, tmp_path, capsys):
 
 
 def test_the_page_is_in_order_escaped_and_needs_no_other_file(tmp_path):
-    model = {'expected_error_m': 0.1, 'previous_error_m': 0.3, 'area_m2': 50.4, 'trained_s': 0.0}
+    (tmp_path / 'a<b & c' / 'inspection').mkdir(parents=True)
+    (tmp_path / 'a<b & c' / 'inspection' / 'index.html').touch()
+    good = {'garden': 'good', 'grade': 'good', 'state': 'good', 'sentences': ['The map is good']}
+    weak = {**good, 'garden': 'weak', 'grade': 'weak', 'state': 'weak', 'expected_error_m': 0.8}
     rows = [
-        {'garden': 'good', 'state': 'good', 'judgments': [('training', 'good', 'The map is good')],
-         'model': model, 'errors_m': {'x': 0.04, 'y': None}, 'page': 'training/index.html'},
-        {'garden': 'a<b & c', 'state': 'refused', 'judgments': [('run', 'bad', 'no <bag>')],
-         'page': 'inspection/index.html'},
-        {'garden': 'weak', 'state': 'weak', 'judgments': [],
-         'model': {**model, 'expected_error_m': 0.8}},
-        {'garden': 'weaker', 'state': 'weak', 'judgments': [],
-         'model': {**model, 'expected_error_m': 0.9}},
-    ]  # fmt: skip
-    write_fleet_page(tmp_path, rows, 2 * 86400.0)
+        {**good, 'expected_error_m': 0.1, 'change_m': -0.2, 'area_m2': 50.4, 'trained_s': 8.64e4},
+        {'garden': 'a<b & c', 'grade': 'bad', 'state': 'refused', 'sentences': ['no <bag>']},
+        weak,
+        {**weak, 'garden': 'weaker', 'expected_error_m': 0.9},
+    ]
+    write_fleet_page(tmp_path, rows, 5, 3 * 8.64e4)
     text = (tmp_path / 'index.html').read_text()
-    cells = [re.findall('<td[^>]*>(.*?)</td>', row) for row in re.findall('<tr.*?</tr>', text)[1:]]
-    names = [re.sub('<.*?>', '', row[0]) for row in cells]
-    assert names == ['a&lt;b &amp; c', 'weaker', 'weak', 'good']
-    assert cells[0][2] == 'run: no &lt;bag&gt;' and set(cells[0][3:]) == {'-'}
-    assert cells[3][3:] == ['0.10', '0.04', '50', '2.0', '-0.20', '-']
-    assert 'href="a%3Cb%20%26%20c/inspection/index.html"' in text
-    assert '1 refused, 2 weak, 1 good' in text and not re.search('src=|<link|http', text)
+    cells = [re.findall('<td>(.*?)</td>', row) for row in re.findall('<tr.*?</tr>', text)[1:]]
+    assert [row[0] for row in cells] == ['a&lt;b &amp; c', 'weaker', 'weak', 'good']
+    assert cells[0][2] == 'no &lt;bag&gt;' and set(cells[0][3:7]) == {'-'}
+    assert cells[3][3:] == ['0.10', '50', '2.0', '-0.20', '']
+    assert 'href="a%3Cb%20%26%20c/inspection/index.html"' in cells[0][7]
+    assert '4 of 5 gardens: 1 refused, 2 weak, 1 good' in text
+    assert not re.search('src=|<link|http', text)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 WRITES = """\
 tables on standard output; with --report index.html (one page for a browser) and its figures;
-  with --json the errors"""
+  with --json the grade (good, weak or bad), a sentence, and the errors"""
 EXAMPLES = """\
   evaluate garden.npz bags/test --align bags/coverage
   evaluate garden.npz bags/test --align none
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Evaluate; print the errors, and counts of used and rejected inputs."""
     from sfa_localization import evaluation
     from sfa_localization.place_model import PlaceModel
-    from sfa_localization.reports.evaluation import count_lines, tables, trust_lines
+    from sfa_localization.reports.evaluation import count_lines, judgment, tables, trust_lines
 
     align, transform = arguments.align, None
     if [str(path) for path in align] == ['none']:
@@ -83,14 +83,14 @@ def run(arguments: argparse.Namespace) -> int:
         smooth=arguments.smooth,
         transform=transform,
     )
-    print(tables(result.scores))
-    print(*trust_lines(result.scores), sep='\n')
+    print(tables(result.scores), *trust_lines(result.scores), sep='\n')
     print(*count_lines(result.counts), sep='\n')
     print(f'aligned on {result.aligned_on}', *result.corrections, sep='\n')
     if arguments.report:
         _write_report(arguments, result)
     if arguments.json:
-        write_json(arguments.json, result.as_dict())
+        grade, sentence = judgment(result.scores, result.counts)
+        write_json(arguments.json, {**result.as_dict(), 'grade': grade, 'sentence': sentence})
     return 0
 
 

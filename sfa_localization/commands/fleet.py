@@ -8,15 +8,13 @@ import argparse
 import multiprocessing
 import os
 import signal
-import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sfa_localization.commands import options
 from sfa_localization.data.errors import ConfigError, LocalizationError
@@ -33,10 +31,8 @@ for each garden model.npz, result.json and its page; index.html, a table of all 
 EXAMPLES = """\
   fleet gardens --output models --workers 4
   fleet gardens.yaml --output /shared/models --scheduler tcp://10.0.0.1:8786"""
-ATTEMPTS = 2
-"""A garden is given up when its process has ended so often: by chance once, not twice."""
-Places = tuple[Callable[[], Executor], Callable[[], int]]
-"""What starts an executor for one garden, and how many gardens are worked on at once."""
+Place = tuple[Callable[..., 'Future[str]'], Callable[[], int]]
+"""The `submit` of an executor, and the number of gardens that are worked on at once."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,24 +48,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Work on all gardens that have changed; print those that are not good."""
-    from sfa_localization.commands.garden import is_up_to_date
+    from sfa_localization.reports.fleet import write_fleet_page
 
     if arguments.workers < 1:
         raise ConfigError('--workers: give 1 or more')
-    output, address = arguments.output.resolve(), arguments.scheduler
-    options.require_report(output, arguments.json)
-    if arguments.json:
-        options.require_output(arguments.json, [], '.json')
+    output, address, file = arguments.output.resolve(), arguments.scheduler, arguments.json
+    options.require_report(output, file)
+    if file:
+        options.require_output(file, [], '.json')
     gardens = _gardens(arguments.gardens, output)
-    changed = [garden for garden in gardens if not is_up_to_date(garden)]
+    changed = [garden for garden in gardens if not garden.is_up_to_date()]
     try:
-        with _cluster(address) if address else _processes(arguments.workers) as places:
-            _work_on(changed, places, len(gardens))
+        with _cluster(address) if address else _processes(arguments.workers) as place:
+            _work_on(changed, place, len(gardens))
     finally:
-        results = _write_results(gardens, output, arguments.json)
+        results = [result for garden in gardens if (result := garden.result())]
+        write_fleet_page(output, results, len(gardens), time.time())
+        if file:
+            write_json(file, {'gardens': results})
     for result in results:
         if result['state'] != 'good':
-            print(f'{result["garden"]}: {result["state"]}: {result["sentence"]}')
+            print(f'{result["garden"]}: {result["state"]}: {result["sentences"][0]}')
     print(f'{output / "index.html"}: written')
     return int(any(result['state'] == 'refused' for result in results))
 
@@ -79,8 +78,7 @@ def _gardens(source: Path, output: Path) -> list[Garden]:
     from sfa_localization.commands.garden import Garden
 
     if source.is_dir():
-        inside = (path for path in sorted(source.iterdir()) if path.name[0] != '.')
-        folders = [path.resolve() for path in inside if path.is_dir()]
+        paths = sorted(path for path in source.iterdir() if path.is_dir() and path.name[0] != '.')
     else:
         try:
             listed = load_yaml(read_text(source, LONGEST, ConfigError))
@@ -88,88 +86,70 @@ def _gardens(source: Path, output: Path) -> list[Garden]:
             raise ConfigError(f'{source}: {error}') from None
         if not isinstance(listed, list):
             raise ConfigError(f'{source}: must be a list, with lines such as "- /bags/garden_1"')
-        folders = [(source.parent / str(name)).resolve() for name in listed]
-    repeated = [name for name, n in Counter(folder.name for folder in folders).items() if n > 1]
-    if repeated or not folders:
-        problem = f'two folders are named {repeated[0]}' if repeated else 'holds no folder'
-        raise ConfigError(f'{source}: {problem}: name a folder for each garden')
-    if output in folders or output.parent == source.resolve():
-        raise ConfigError(f'{output}: lies among the gardens: give --output another place')
+        paths = [source.parent / str(name) for name in listed]
+    folders = [path.resolve() for path in paths if path.resolve() != output]
+    if not folders or len({folder.name for folder in folders}) < len(folders):
+        raise ConfigError(f'{source}: name at least one folder, each with another name')
     return [Garden(folder, output / folder.name) for folder in folders]
 
 
 @contextmanager
-def _processes(workers: int) -> Iterator[Places]:
+def _processes(workers: int) -> Iterator[Place]:
     """A process for each garden: one that dies takes no other along."""
     context = multiprocessing.get_context('spawn')
+
+    def submit(work: Callable[[Garden], str], garden: Garden) -> Future[str]:
+        executor = ProcessPoolExecutor(1, context, _leave_ctrl_c_to_the_parent)
+        future = executor.submit(work, garden)
+        executor.shutdown(wait=False)  # the process ends after this garden
+        return future
+
     try:
-        yield lambda: ProcessPoolExecutor(1, context, _begin), lambda: workers
+        yield submit, lambda: workers
     finally:
         for process in multiprocessing.active_children():
             process.terminate()
 
 
-def _begin() -> None:
-    """In a new process: leave Ctrl-C to the parent, which then terminates it, and end with it."""
+def _leave_ctrl_c_to_the_parent() -> None:
+    """The parent terminates a process, which then removes its temporary files."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # to remove temporary files
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    if parent := multiprocessing.parent_process():
-        parent.join()
-        os._exit(1)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[Places]:
+def _cluster(address: str) -> Iterator[Place]:
     """The workers of a Dask scheduler, also those that come later. Raises OSError without it."""
     from distributed import Client
 
     with Client(address) as client:
-        start = partial(client.get_executor, pure=False)  # work is done again, not remembered
-        yield start, lambda: max(1, sum(client.nthreads().values()))
+        executor = client.get_executor(pure=False)  # work is done again, not remembered
+        yield executor.submit, lambda: max(1, sum(client.nthreads().values()))
 
 
-def _work_on(gardens: Sequence[Garden], places: Places, total: int) -> None:
-    """Work on the gardens that changed, of a total; give up those whose process ends again."""
+def _work_on(gardens: Sequence[Garden], place: Place, total: int) -> None:
+    """Work on the gardens that changed, of a total; give up those whose work fails twice."""
     from sfa_localization.commands.garden import give_up, work
 
-    start, limit = places
+    submit, limit = place
     waiting, refused = deque(gardens), 0
-    failures: Counter[Garden] = Counter()
-    running: dict[Future[str], tuple[Garden, Executor]] = {}
+    running: dict[Future[str], Garden] = {}
+    failed: set[Garden] = set()
     with progress_bar('fleet', total, 'gardens', total - len(gardens), visible=True) as bar:
         while waiting or running:
             while waiting and len(running) < limit():
-                garden, executor = waiting.popleft(), start()
-                running[executor.submit(work, garden)] = garden, executor
+                garden = waiting.popleft()
+                running[submit(work, garden)] = garden
             bar.set_description_str(f'running {len(running)}, refused {refused}', refresh=False)
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                garden, executor = running.pop(future)
+                garden = running.pop(future)
                 if future.cancelled():
                     raise LocalizationError('the scheduler has ended: start it, and repeat this')
-                executor.shutdown()
                 error = future.exception()
-                failures[garden] += error is not None
-                if error and failures[garden] < ATTEMPTS:
+                if error and garden not in failed:
+                    failed.add(garden)
                     waiting.append(garden)
                     continue
                 state = give_up(garden, error) if error else future.result()
                 refused += state == 'refused'
                 bar.update()
-
-
-def _write_results(
-    gardens: Sequence[Garden], output: Path, file: Path | None
-) -> list[dict[str, Any]]:
-    """Write the page, and all results as JSON; a garden without a result is waiting."""
-    from sfa_localization.reports.fleet import write_fleet_page
-
-    waiting = {'state': 'waiting', 'sentence': 'run the command again', 'judgments': []}
-    results = [g.result() or {'garden': g.output.name, **waiting} for g in gardens]
-    write_fleet_page(output, results, time.time())
-    if file:
-        write_json(file, {'gardens': results})
-    return results

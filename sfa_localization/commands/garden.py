@@ -1,45 +1,32 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The work on one garden of a fleet: inspect its bags, train or update its model, evaluate it."""
+"""The work on one garden of a fleet, by the commands inspect, train and evaluate."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from sfa_localization import __version__
-from sfa_localization.bags.recording import METADATA, SUFFIXES, recorded_files
-from sfa_localization.camera.settings import WatchConfig
-from sfa_localization.commands import options
-from sfa_localization.commands.inspect import inspected
-from sfa_localization.commands.inspect import write_report as write_inspection
-from sfa_localization.commands.train import write_report as write_training
+from sfa_localization.bags.recording import recorded_files
+from sfa_localization.commands import evaluate, inspect, train
 from sfa_localization.data.errors import BagError, LocalizationError, ModelError
 from sfa_localization.data.files import read_text, write_json
-from sfa_localization.data.geometry import RigidTransform
 from sfa_localization.data.plain_yaml import LONGEST
-from sfa_localization.evaluation import evaluate
-from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.inspection import InspectionConfig, lacks_together
-from sfa_localization.metric.settings import GroundConfig, MetricConfig
-from sfa_localization.place_model import PlaceModel
-from sfa_localization.reports.evaluation import judgment as judgment_of_drive
-from sfa_localization.reports.page import BAD, GOOD, PAGE, WEAK
-from sfa_localization.reports.summary import judgment
-from sfa_localization.training import Recipe, train
-from sfa_localization.updating import update
+from sfa_localization.reports.fleet import STATES
+from sfa_localization.reports.page import BAD, WEAK
 
-CONFIG, POINTS, TESTS, RESULT = 'localization.yaml', 'points.csv', 'test', 'result.json'
-STATES = {GOOD: 'good', WEAK: 'weak', BAD: 'refused'}
-"""State of a garden by the worst grade of its judgments; the worst is last."""
-Judgment = tuple[str, ...]
-"""What is judged (run, training, inspection, update, or a test drive), grade, and sentence."""
+CONFIG, POINTS, TESTS = 'localization.yaml', 'points.csv', 'test'
+TRAINING = 'training.json'
+Judgment = Mapping[str, Any]
+"""What a command writes as JSON, with a `grade` of STATES and a `sentence`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,56 +41,50 @@ class Garden:
         """The file of the model."""
         return self.output / 'model.npz'
 
-    def inputs(self, bags: Iterable[Path]) -> dict[str, Any]:
-        """The version, and size and time (ns) of each file of bags and options. Raises OSError."""
-        paths = *bags, self.folder / CONFIG, self.folder / POINTS
-        files = (file for path in paths for file in recorded_files(path) if file.is_file())
-        states = {os.path.relpath(file, self.folder): file.stat() for file in files}
+    def bags(self, folder: str = '') -> list[Path]:
+        """All that is in the garden, or in a folder of it, beside its options."""
+        inside, others = self.folder / folder, (CONFIG, POINTS, TESTS)
+        paths = sorted(inside.iterdir()) if inside.is_dir() else []
+        return [path for path in paths if path.name not in others and path.name[0] != '.']
+
+    def option(self, name: str, file: str) -> list[Path | str]:
+        """The words of an option, if the garden has the file that it names."""
+        path = self.folder / file
+        return [name, path] if path.is_file() else []
+
+    def inputs(self) -> dict[str, Any]:
+        """The version, and size and time (ns) of all files of bags and options, by their names."""
+        paths = [*self.bags(), *self.bags(TESTS), self.folder / CONFIG, self.folder / POINTS]
+        files = [file for path in paths for file in recorded_files(path) if file.is_file()]
+        states = {str(file.relative_to(self.folder)): file.stat() for file in files}
         stamps = {name: [state.st_size, state.st_mtime_ns] for name, state in states.items()}
         return {'version': __version__, **stamps}
 
     def result(self) -> dict[str, Any]:
         """What the last run wrote; {} without a readable file."""
-        try:
-            text = read_text(self.output / RESULT, LONGEST, LocalizationError)
-            return dict(json.loads(text))
-        except (LocalizationError, ValueError):
-            return {}
+        return _read_json(self.output / 'result.json')
 
-    def lasting(self) -> list[Judgment]:
-        """Judgments of the model that is there, which hold until it is trained again."""
-        judgments = self.result().get('judgments', []) if self.model.is_file() else []
-        return [tuple(item) for item in judgments if item[0] in ('training', 'inspection')]
+    def is_up_to_date(self) -> bool:
+        """Whether the last run read the same files, and its model is there."""
+        result = self.result()
+        done = self.model.is_file() or result.get('grade') == BAD
+        return done and bool(result.get('inputs') == self.inputs())
 
-    def write(self, judgments: Sequence[Judgment], **more: Any) -> str:
-        """Write the result, and return the state. Raises LocalizationError."""
-        _, grade, sentence = max(judgments, key=lambda judgment: [*STATES].index(judgment[1]))
-        head = {'garden': self.output.name, 'state': STATES[grade], 'sentence': sentence}
-        write_json(self.output / RESULT, {**head, 'judgments': judgments, **more})
+    def write(self, result: Mapping[str, Any], judgments: Sequence[Judgment]) -> str:
+        """Write a result with judgments, the worst first; the state. Raises LocalizationError."""
+        ordered = sorted(judgments, key=lambda judgment: [*STATES].index(judgment['grade']))
+        grade, sentences = ordered[0]['grade'], [judgment['sentence'] for judgment in ordered]
+        head = {'garden': self.output.name, 'grade': grade, 'state': STATES[grade]}
+        write_json(self.output / 'result.json', {**result, **head, 'sentences': sentences})
         return STATES[grade]
 
 
-def bags_in(folder: Path) -> list[Path]:
-    """The folder if it holds files of a bag, else the bags in it, by name. Raises OSError."""
-    if _is_bag(folder):
-        return [folder]
-    inside = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [path for path in inside if path.name != TESTS and _is_bag(path)]
-
-
-def _is_bag(path: Path) -> bool:
-    names = os.listdir(path) if path.is_dir() else [path.name]
-    return any(name == METADATA or name.endswith(SUFFIXES) for name in names)
-
-
-def is_up_to_date(garden: Garden) -> bool:
-    """Whether the last run read the same bags and options, and its model is there."""
-    result, folder = garden.result(), garden.folder
+def _read_json(path: Path) -> dict[str, Any]:
+    """A mapping that a run has written; {} without a readable file."""
     try:
-        inputs = garden.inputs([*bags_in(folder), *bags_in(folder / TESTS)])
-    except OSError:  # which the work on this garden meets again, and reports
-        return False
-    return result.get('inputs') == inputs and (not result['model'] or garden.model.is_file())
+        return dict(json.loads(read_text(path, LONGEST, LocalizationError)))
+    except (LocalizationError, ValueError):
+        return {}
 
 
 def work(garden: Garden) -> str:
@@ -111,107 +92,89 @@ def work(garden: Garden) -> str:
 
     A LocalizationError is a result; any other error is raised, and no result is written.
     """
-    start_s, before, page = time.time(), garden.result(), 'training'
-    tests, model = bags_in(garden.folder / TESTS), before.get('model')
-    inputs = garden.inputs([*bags_in(garden.folder), *tests])
-    errors_m: dict[str, float] = {}
-    try:
-        settings = _settings(garden)
-        model, judgments = _learn(garden, settings, before)
-        for bag in tests:
-            judgments.append(_evaluate(garden, settings, bag, errors_m))
-    except LocalizationError as error:
-        page, judgments = 'inspection', [('run', BAD, str(error)), *garden.lasting()]
-    return garden.write(
-        judgments,
-        model=model if garden.model.is_file() else None,
-        errors_m=errors_m,
-        page=f'{page}/{PAGE}' if (garden.output / page / PAGE).is_file() else '',
-        seconds=round(time.time() - start_s, 1),
-        inputs=inputs,
-    )
+    result, inputs = garden.result(), garden.inputs()
+    with redirect_stdout(StringIO()) as output, redirect_stderr(output):
+        try:
+            training, updates = _learn(garden, result, inputs)
+            quality = training['quality']
+            judgments = [training, *updates, *_evaluate(garden, 'points' in quality)]
+            error_m, (along, across) = quality['expected_error_m'], quality['coverage']['extent_m']
+            result['change_m'] = error_m - result.get('expected_error_m', error_m)
+            result |= {'expected_error_m': error_m, 'area_m2': along * across}
+            result['trained_s'] = (garden.output / TRAINING).stat().st_mtime
+        except LocalizationError as error:
+            judgments = [{'grade': BAD, 'sentence': str(error)}]
+    return garden.write({**result, 'inputs': inputs}, judgments)
 
 
 def give_up(garden: Garden, error: BaseException) -> str:
     """Write that the work on a garden ended in errors; the next run tries it again."""
     words = ' '.join(f'{type(error).__name__}: {error}'.split())
     sentence = f'its process ended twice, the last time by {words}: was the memory full?'
-    judgments = [('run', BAD, sentence), *garden.lasting()]
-    return garden.write(judgments, model=garden.result().get('model'))
-
-
-def _settings(garden: Garden) -> dict[str, Any]:
-    """What the garden's files set, as keywords of `update` and `evaluate`. Raises ConfigError."""
-    config, points = garden.folder / CONFIG, garden.folder / POINTS
-    arguments = argparse.Namespace(config=config if config.is_file() else None)
-    if points.is_file():
-        setattr(arguments, options.destination(MetricConfig, 'points'), str(points))
-    watch, recipe = options.settings(WatchConfig, arguments), options.recipe(arguments)
-    return {'recipe': recipe, 'watch': watch, 'config': options.settings(FilterConfig, arguments)}
+    result = {**garden.result(), 'inputs': {}}
+    return garden.write(result, [{'grade': BAD, 'sentence': sentence}])
 
 
 def _learn(
-    garden: Garden, settings: dict[str, Any], before: dict[str, Any]
-) -> tuple[dict[str, Any], list[Judgment]]:
-    """Train, or where only bags were added update the model; its figures, and judgments."""
-    model, bags = before.get('model') or {'learned': {}}, bags_in(garden.folder)
-    learned = model['learned']
-    new = [bag for bag in bags if not garden.inputs([bag]).items() <= learned.items()]
-    if garden.inputs(set(bags) - set(new)) != learned or not garden.model.is_file():
-        return _train(garden, settings['recipe'], bags, model.get('expected_error_m'))
-    judgments, saved = garden.lasting(), PlaceModel.load(garden.model)
-    for bag in new:
-        try:
-            updated = update(saved, [bag], garden.model, **settings)
-        except LocalizationError as error:
-            judgments.append(('update', WEAK, f'{error}; the model stays without this drive'))
-            continue
-        saved, learned = updated.model, {**learned, **garden.inputs([bag])}
-        judgments.append(('update', GOOD, updated.sentence()))
-    return {**model, 'learned': learned}, judgments
+    garden: Garden, before: Mapping[str, Any], inputs: Mapping[str, Any]
+) -> tuple[Judgment, list[Judgment]]:
+    """Update a useful model where only drives were added, else train.
+
+    Returns the judgments of the training, which may be that of an earlier run, and of each update.
+    """
+    old, config = before.get('inputs', {}), garden.option('--config', CONFIG)
+    changes = {name for name in {*old, *inputs} if old.get(name) != inputs.get(name)}
+    changed, former = ({Path(name).parts[0] for name in names} for names in (changes, old))
+    added = [drive for drive in garden.bags() if drive.name in changed - former]
+    useful = garden.model.is_file() and before.get('grade') != BAD
+    if not useful or changed - {TESTS, *(drive.name for drive in added)}:
+        return _train(garden, config), []
+    words = *config, '--update', garden.model, '--output', garden.model
+    updates = [_attempt(train, garden.output / 'update.json', drive, *words) for drive in added]
+    return _read_json(garden.output / TRAINING), updates
 
 
-def _train(
-    garden: Garden, recipe: Recipe, bags: Sequence[Path], previous_error_m: float | None
-) -> tuple[dict[str, Any], list[Judgment]]:
-    """Inspect and train, with a page of each; the figures of the model, and judgments."""
-    if not bags:
+def _train(garden: Garden, config: Sequence[Path | str]) -> Judgment:
+    """Inspect and train, with a page of each."""
+    drives, pages = garden.bags(), [garden.output / name for name in ('inspection', 'training')]
+    if not drives:
         raise BagError(f'{garden.folder}: holds no bag: record one into this folder')
-    inputs, config = garden.inputs(bags), InspectionConfig()
-    reports = inspected(bags, recipe.topics, config, recipe.panorama.clockwise)
-    write_inspection(garden.output / 'inspection', reports)
-    try:  # to continue a training that was interrupted
-        trained = train(bags, garden.model, recipe, resume=True)
-    except ModelError:  # it was of other bags or parameters
-        trained = train(bags, garden.model, recipe)
-    write_training(garden.output / 'training', bags, trained, recipe)
-    ground = GroundConfig()
-    model = {
-        'learned': inputs,
-        'trained_s': time.time(),
-        'expected_error_m': trained.model.quality['expected_error_m'],
-        'previous_error_m': previous_error_m,
-        'area_m2': float(trained.model.ground.cells(ground).driven.sum() * ground.cell**2),
-    }
-    lacks = [('inspection', WEAK, text) for text in lacks_together(reports, config)]
-    return model, [('training', *judgment(trained)), *lacks]
+    _run(inspect, garden.output / 'inspection.json', *drives, *config, '--report', pages[0])
+    words = [*drives, *config, *garden.option('--points', POINTS)]
+    words += ['--output', garden.model, '--report', pages[1]]
+    try:
+        return _run(train, garden.output / TRAINING, *words, '--resume')
+    except ModelError:  # the interrupted training was of other bags or parameters
+        return _run(train, garden.output / TRAINING, *words)
 
 
-def _evaluate(
-    garden: Garden, settings: dict[str, Any], bag: Path, errors_m: dict[str, float]
-) -> Judgment:
-    """Add the mean error (m) of the filter on a test drive, where it has ground truth; judge it.
+def _evaluate(garden: Garden, has_points: bool) -> list[Judgment]:
+    """Judge the filter on each test drive, with a page.
 
     The map is aligned by measured points, or on the drives of the training.
     """
-    model = PlaceModel.load(garden.model)
-    if model.quality.get('points'):
-        settings = {**settings, 'transform': RigidTransform(0.0, 0.0, 0.0)}
-    else:
-        settings = {**settings, 'align_bags': bags_in(garden.folder)}
+    words, judgments = garden.option('--config', CONFIG), list[Judgment]()
+    for drive in ['none'] if has_points else garden.bags():
+        words += ['--align', drive]
+    for bag in garden.bags(TESTS):
+        page = garden.output / f'test_{bag.name}'
+        report = *words, '--report', page
+        judgments.append(_attempt(evaluate, page / 'scores.json', bag, garden.model, *report))
+    return judgments
+
+
+def _attempt(command: ModuleType, file: Path, bag: Path, *words: Path | str) -> Judgment:
+    """The judgment of a command on a bag, without which the model is useful too."""
     try:
-        result = evaluate(model, bag, **settings)
+        judgment = _run(command, file, *words, bag)
     except LocalizationError as error:
-        return f'test {bag.name}', GOOD, f'not evaluated: {error}'
-    errors_m[bag.name] = result.scores['ekf']['mean']
-    return f'test {bag.name}', *judgment_of_drive(result.scores, result.counts)
+        return {'grade': WEAK, 'sentence': f'not used: {error}'}
+    return {**judgment, 'sentence': f'{bag.name}: {judgment["sentence"]}'}
+
+
+def _run(command: ModuleType, file: Path, *words: Path | str) -> Judgment:
+    """Run a command with words of its command line; what it writes as JSON into a file."""
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    command.run(parser.parse_intermixed_args([*map(str, words), '--json', str(file)]))
+    return _read_json(file)

@@ -46,20 +46,25 @@ def run(arguments: argparse.Namespace) -> int:
     topics = options.settings(TopicNames, arguments)
     config = options.settings(InspectionConfig, arguments)
     clockwise = options.settings(PanoramaConfig, arguments).clockwise
+    strict = arguments.strict
     if arguments.json:
         options.require_output(arguments.json, arguments.bags, '.json')
     options.require_report(arguments.report, arguments.json)
-    reports = inspected(arguments.bags, topics, config, clockwise, strict=arguments.strict)
+    reports = []
+    for path in arguments.bags:
+        try:
+            reports.append(
+                inspect(path, topics=topics, config=config, clockwise=clockwise, strict=strict)
+            )
+        except BagError as error:
+            reports.append(BagReport(str(path), error=str(error)))
     lacks = lacks_together(reports, config)
     if arguments.json:
         together = {'enough_to_train_on': not lacks, 'lacks': lacks}
         bags = [report.as_dict() for report in reports]
         write_json(arguments.json, {'bags': bags, 'together': together})
     if arguments.report:
-        from sfa_localization.reports.page import PAGE
-
-        write_report(arguments.report, reports)
-        print(f'{arguments.report / PAGE}: written')
+        _write_report(arguments.report, reports)
     for report in reports:
         print(report.as_text(), file=sys.stderr if report.error else sys.stdout)
     if len(reports) > 1:
@@ -70,31 +75,11 @@ def run(arguments: argparse.Namespace) -> int:
     return int(any(r.error or any(topic.unreadable for topic in r.topics) for r in reports))
 
 
-def inspected(
-    paths: Sequence[Path],
-    topics: TopicNames,
-    config: InspectionConfig,
-    clockwise: bool,
-    *,
-    strict: bool = False,
-) -> list[BagReport]:
-    """The findings about each bag; an unreadable one has its error."""
-    reports = []
-    for path in paths:
-        try:
-            reports.append(
-                inspect(path, topics=topics, config=config, clockwise=clockwise, strict=strict)
-            )
-        except BagError as error:
-            reports.append(BagReport(str(path), error=str(error)))
-    return reports
-
-
-def write_report(folder: Path, reports: Sequence[BagReport]) -> None:
-    """Write figures of all bags, and the page that shows them. Raises LocalizationError."""
+def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:
+    """Write figures of all bags, and the page that shows them."""
     from sfa_localization.reports.bag import bag_sections, write_path
     from sfa_localization.reports.figures import write_contact_sheet
-    from sfa_localization.reports.page import begin_page, write_page
+    from sfa_localization.reports.page import PAGE, begin_page, write_page
 
     begin_page(folder)
     sections = []
@@ -115,3 +100,4 @@ def write_report(folder: Path, reports: Sequence[BagReport]) -> None:
         facts = [': '.join(fact) for fact in report.facts.items()]
         sections += bag_sections(report.as_dict(), facts, figures)
     write_page(folder, 'What is in the recording', *sections)
+    print(f'{folder / PAGE}: written')

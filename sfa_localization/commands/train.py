@@ -5,14 +5,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.commands import options
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.data.files import first_bytes
+from sfa_localization.data.files import first_bytes, write_json
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.sfa.settings import NetworkConfig
@@ -20,7 +20,9 @@ from sfa_localization.sfa.settings import NetworkConfig
 if TYPE_CHECKING:
     from sfa_localization.training import Recipe, Trained
 
-WRITES = 'MODEL.npz; with --report index.html (one page for a browser) and its figures'
+WRITES = """\
+MODEL.npz; with --report index.html (one page for a browser) and its figures; with --json the
+  grade (good, weak or bad), the first sentence, and the quality of the map"""
 EXAMPLES = """\
   train bags/coverage --output garden.npz
   train bags/a bags/b --output garden.npz --config localization.yaml --report report
@@ -41,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--config', type=Path, help='parameter file')
     parser.add_argument('--report', type=Path, metavar='DIR', help='write figures of the training')
+    parser.add_argument('--json', type=Path, metavar='FILE', help='write the judgment as JSON')
     parser.add_argument('--resume', action='store_true', help='continue an interrupted training')
     parser.add_argument('--strict', action='store_true', help='reject damaged bags')
     parser.add_argument('--force', action='store_true', help='train also on contradictory motion')
@@ -52,14 +55,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Train or update; print the summary."""
-    options.require_output(arguments.output, [*arguments.bags, arguments.config], '.npz')
-    options.require_report(arguments.report, arguments.output)
+    for output, suffix in ((arguments.output, '.npz'), (arguments.json, '.json')):
+        if output:
+            options.require_output(output, [*arguments.bags, arguments.config], suffix)
+            options.require_report(arguments.report, output)
     replaces = bool(first_bytes(arguments.output)) and arguments.output != arguments.update
     written = f'{arguments.output}: written' + ', the model that was there is replaced' * replaces
     if arguments.update:
         return _update(arguments, written)
     from sfa_localization import training
-    from sfa_localization.reports.summary import summary
+    from sfa_localization.reports.summary import judgment, summary
 
     used = options.recipe(arguments)
     trained = training.train(
@@ -73,10 +78,9 @@ def run(arguments: argparse.Namespace) -> int:
     )
     print(summary(trained))
     if arguments.report:
-        from sfa_localization.reports.page import PAGE
-
-        write_report(arguments.report, arguments.bags, trained, used)
-        print(f'{arguments.report / PAGE}: written')
+        _write_report(arguments.report, arguments.bags, trained, used)
+    if arguments.json:
+        _write_judgment(arguments.json, *judgment(trained), quality=trained.model.quality)
     print(written)
     return 0
 
@@ -90,6 +94,7 @@ def _update(arguments: argparse.Namespace, written: str) -> int:
         option = unused[0].replace('_', '-')
         raise ConfigError(f'--{option} has no effect on --update: leave one of them out')
     from sfa_localization.place_model import PlaceModel
+    from sfa_localization.reports.summary import GOOD
     from sfa_localization.updating import update
 
     model = PlaceModel.load(arguments.update)
@@ -105,17 +110,20 @@ def _update(arguments: argparse.Namespace, written: str) -> int:
         strict=arguments.strict,
     )
     print(updated.sentence())
+    if arguments.json:
+        _write_judgment(arguments.json, GOOD, updated.sentence())
     print(written)
     return 0
 
 
-def write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Recipe) -> None:
-    """Write figures and the page; the worst images are read from the bags again.
+def _write_judgment(file: Path, grade: str, sentence: str, **more: Mapping[str, Any]) -> None:
+    write_json(file, {'grade': grade, 'sentence': sentence, **more})
 
-    Raises LocalizationError.
-    """
+
+def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Recipe) -> None:
+    """Write figures and the page; the worst images are read from the bags again."""
     from sfa_localization.bags.drives import images_at
-    from sfa_localization.reports.page import begin_page
+    from sfa_localization.reports.page import PAGE, begin_page
     from sfa_localization.reports.training import worst_of, write_training_report
 
     worst = worst_of(trained)
@@ -126,3 +134,4 @@ def write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Rec
     samples = {image: read[run][at] for image, (run, at) in worst.items() if at in read[run]}
     begin_page(folder)
     write_training_report(folder, trained, samples)
+    print(f'{folder / PAGE}: written')
