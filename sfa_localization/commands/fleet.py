@@ -8,6 +8,7 @@ import argparse
 import multiprocessing
 import os
 import signal
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -114,7 +115,7 @@ def _processes(workers: int) -> Iterator[Place]:
 def _leave_ctrl_c_to_the_parent() -> None:
     """The parent terminates a process, which then removes its temporary files."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))
 
 
 @contextmanager

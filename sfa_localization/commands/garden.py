@@ -20,6 +20,8 @@ from sfa_localization.commands import evaluate, inspect, train
 from sfa_localization.data.errors import BagError, LocalizationError, ModelError
 from sfa_localization.data.files import read_text, write_json
 from sfa_localization.data.plain_yaml import LONGEST
+from sfa_localization.metric.settings import GroundConfig
+from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.fleet import STATES
 from sfa_localization.reports.page import BAD, WEAK
 
@@ -95,12 +97,13 @@ def work(garden: Garden) -> str:
     result, inputs = garden.result(), garden.inputs()
     with redirect_stdout(StringIO()) as output, redirect_stderr(output):
         try:
-            training, updates = _learn(garden, result, inputs)
-            quality = training['quality']
-            judgments = [training, *updates, *_evaluate(garden, 'points' in quality)]
-            error_m, (along, across) = quality['expected_error_m'], quality['coverage']['extent_m']
+            training, *updates = _learn(garden, result, inputs)
+            model = PlaceModel.load(garden.model)
+            judgments = [training, *updates, *_evaluate(garden, 'points' in model.quality)]
+            error_m = model.quality['expected_error_m']
             result['change_m'] = error_m - result.get('expected_error_m', error_m)
-            result |= {'expected_error_m': error_m, 'area_m2': along * across}
+            result['expected_error_m'] = error_m
+            result['area_m2'] = model.ground.cells(GroundConfig()).area_m2
             result['trained_s'] = (garden.output / TRAINING).stat().st_mtime
         except LocalizationError as error:
             judgments = [{'grade': BAD, 'sentence': str(error)}]
@@ -115,9 +118,7 @@ def give_up(garden: Garden, error: BaseException) -> str:
     return garden.write(result, [{'grade': BAD, 'sentence': sentence}])
 
 
-def _learn(
-    garden: Garden, before: Mapping[str, Any], inputs: Mapping[str, Any]
-) -> tuple[Judgment, list[Judgment]]:
+def _learn(garden: Garden, before: Mapping[str, Any], inputs: Mapping[str, Any]) -> list[Judgment]:
     """Update a useful model where only drives were added, else train.
 
     Returns the judgments of the training, which may be that of an earlier run, and of each update.
@@ -128,24 +129,25 @@ def _learn(
     added = [drive for drive in garden.bags() if drive.name in changed - former]
     useful = garden.model.is_file() and before.get('grade') != BAD
     if not useful or changed - {TESTS, *(drive.name for drive in added)}:
-        return _train(garden, config), []
+        return [_train(garden, config)]
     words = *config, '--update', garden.model, '--output', garden.model
     updates = [_attempt(train, garden.output / 'update.json', drive, *words) for drive in added]
-    return _read_json(garden.output / TRAINING), updates
+    return [_read_json(garden.output / TRAINING), *updates]
 
 
 def _train(garden: Garden, config: Sequence[Path | str]) -> Judgment:
     """Inspect and train, with a page of each."""
-    drives, pages = garden.bags(), [garden.output / name for name in ('inspection', 'training')]
+    drives, output = garden.bags(), garden.output
     if not drives:
         raise BagError(f'{garden.folder}: holds no bag: record one into this folder')
-    _run(inspect, garden.output / 'inspection.json', *drives, *config, '--report', pages[0])
+    report = '--report', output / 'inspection'
+    _run(inspect, output / 'inspection.json', *drives, *config, *report)
     words = [*drives, *config, *garden.option('--points', POINTS)]
-    words += ['--output', garden.model, '--report', pages[1]]
+    words += ['--output', garden.model, '--report', output / 'training']
     try:
-        return _run(train, garden.output / TRAINING, *words, '--resume')
+        return _run(train, output / TRAINING, *words, '--resume')
     except ModelError:  # the interrupted training was of other bags or parameters
-        return _run(train, garden.output / TRAINING, *words)
+        return _run(train, output / TRAINING, *words)
 
 
 def _evaluate(garden: Garden, has_points: bool) -> list[Judgment]:

@@ -51,6 +51,5 @@ def run(arguments: argparse.Namespace) -> int:
         file.write(f'P5\n{width} {height}\n255\n'.encode() + gray.tobytes())
     with atomic_write(output) as file:
         file.write(_YAML.format(image=image.name, cell=config.cell, x=x, y=y).encode())
-    area = cells.driven.sum() * config.cell**2
-    print(f'{output}, {image}: written; the robot drove on {area:.0f} m2')
+    print(f'{output}, {image}: written; the robot drove on {cells.area_m2:.0f} m2')
     return 0

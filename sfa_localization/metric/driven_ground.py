@@ -31,6 +31,11 @@ class Cells:
     corner: Array
     size_m: float
 
+    @property
+    def area_m2(self) -> float:
+        """Area of the cells on which the robot drove."""
+        return float(self.driven.sum() * self.size_m**2)
+
 
 @dataclass(frozen=True, slots=True)
 class DrivenGround:
