@@ -14,9 +14,8 @@ from sfa_localization.reports import page
 
 STATES = {page.BAD: 'refused', page.WEAK: 'weak', page.GOOD: 'good'}
 """State of a garden by the worst grade of its judgments; the worst is first."""
-_COLUMNS = ('garden', 'state', 'why', 'expected error (m)', 'area (m2)', 'age (days)', 'change (m)',
-            'pages')  # fmt: skip
-_NOTE = 'Expected error: of one image. Change: of this error since the training before.'
+_COLUMNS = ('garden', 'state', 'why', 'expected error of an image (m)', 'area (m2)',
+            'age of the training (days)', 'change of the error (m)', 'pages')  # fmt: skip
 _SCRIPT = """
 <style>body { max-width: none; } th { cursor: pointer; } td { vertical-align: top; }
 th:nth-child(-n+3), td:nth-child(-n+3) { text-align: left; } td:nth-child(3) { min-width: 20rem; }
@@ -48,7 +47,7 @@ def write_fleet_page(
     page.write_page(
         folder,
         f'{len(results)} of {total} gardens: {", ".join(counts)}',
-        f'<p>{_NOTE}</p><p><input type="search" placeholder="search" aria-label="search"></p>',
+        '<p><input type="search" placeholder="search" aria-label="search"></p>',
         f'<div class="wide"><table><thead><tr>{head}</tr></thead>',
         f'<tbody>{body}</tbody></table></div>{_SCRIPT}',
     )
