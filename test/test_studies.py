@@ -25,9 +25,10 @@ from sfa_localization.simulation.settings import SimulationConfig
 
 MINUTES = dict.fromkeys(NAMES, 1)
 PLAN = SitePlan((6.0, 6.0), (160, 16), {'coverage': 150, 'lines': 120, 'mower': 200}, MINUTES)
-LIGHTS = light.LightPlan((6.0, 6.0), (160, 16), (('day', 'summer'), ('evening', 'summer')), (), 1)
+LIGHTS = light.LightPlan((6.0, 6.0), (160, 16), (('day', 'summer'), ('evening', 'summer')), 1)
 NAMED = {'ablations': 'paper', 'baselines': 'paper', 'light': 'light', 'year': 'year'}
 MONTHS = (('July', 'day', 'summer'), ('August', 'evening', 'summer'))
+EVERYTHING = next(iter(VARIANTS))
 
 
 def cells(file):
@@ -38,13 +39,13 @@ def cells(file):
 def made(tmp_path_factory, gardens, small_network):
     """Studies, once, in a folder each; test_reproduce_quick.py makes the others."""
     out = tmp_path_factory.mktemp('studies')
-    variants = ('everything', 'no keyframes', 'four layers')
+    variants = (EVERYTHING, 'one image by slow features alone', 'no second pass')
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(comparisons, 'VARIANTS', {name: VARIANTS[name] for name in variants})
         patch.setattr(studies, 'QUICK', PLAN)
-        patch.setattr(light, 'QUICK', LIGHTS)
+        patch.setattr(light, 'PLAN', LIGHTS)
         patch.setattr(year, 'MONTHS', MONTHS)
-        patch.setattr(year, 'QUICK_YEAR', year.YearPlan((6.0, 6.0), (160, 16), (2,), 1))
+        patch.setattr(year, 'QUICK_YEAR', year.YearPlan((6.0, 6.0), (160, 16), 2, 1))
         # Few messages are enough, and quicker to write and read.
         slow = partial(SimulationConfig, odometry_rate=20.0)
         for module in (sites, light, year):
@@ -65,23 +66,20 @@ def test_comparisons_judge_every_recipe_alike(made):
     assert baselines['slow features, first pass']['test'] < 1.5
     assert baselines[comparisons.RETRIEVAL]['test_supervised'] < 1
     ablations = {cell['variant']: cell for cell in cells(made / 'paper' / 'ablations.json')}
-    whole, bare = ablations['everything'], ablations['no keyframes']
-    assert bare['slow'] == whole['slow'] == bare['sfa'] != whole['sfa']
-    assert 'rows' in ablations['four layers']['problem'], 'these images are too small for it'
+    assert len({cell['sfa'] for cell in ablations.values()}) == 3, 'each locates otherwise'
+    assert all(cell['sfa'] < 1.5 and cell['sfa_nees'] > 0 for cell in ablations.values())
 
 
 @pytest.mark.study
 def test_lights_and_months_are_judged_before_anything_is_learned(made):
     matrix = cells(made / 'light' / 'matrix.json')
-    assert [cell['trained'] for cell in matrix] == ['day'] * 2 + ['day + overcast'] * 2
+    assert [cell['light'] for cell in matrix] == ['day', 'evening']
     for cell in matrix:
         assert 0 <= cell['localized'] <= 1 and 0 < cell['sfa']['mean_m'] < 6
-        assert cell['slow']['mean_m'] > 0 and ('paper' in cell) == (cell['trained'] == 'day')
-    assert matrix[0]['retrieval']['mean_m'] < 1
+        assert cell['slow']['mean_m'] > 0 and 'paper' in cell
     months = {(cell['month'], cell['model']): cell for cell in cells(made / 'year' / 'year.json')}
     assert months['July', 'frozen']['ekf_m'] == months['July', 'updated']['ekf_m']
-    models = {model for month, model in months if month == 'August'}
-    assert models == {'frozen', 'updated', 'retrained'}
+    assert {model for month, model in months if month == 'August'} == {'frozen', 'updated'}
 
 
 @pytest.mark.study
@@ -90,7 +88,7 @@ def test_what_is_finished_is_not_made_again(made, monkeypatch, capsys):
                          (comparisons, 'evaluate')):  # fmt: skip
         monkeypatch.setattr(module, step, mock.Mock(side_effect=AssertionError))
     made_in(made)
-    assert '| everything |' in capsys.readouterr().out
+    assert f'| {EVERYTHING} |' in capsys.readouterr().out
 
 
 def test_a_foreign_folder_and_results_of_other_settings_are_left_alone(tmp_path):

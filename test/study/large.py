@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from page_tables import markdown
 
 from sfa_localization.bags.drives import as_live
 from sfa_localization.bags.reader import Bag
@@ -25,8 +26,9 @@ from sfa_localization.observer import Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import Recipe, train
-from study.results import Cell, Progress, StudyConfig, recorded
+from study.results import Cell, Progress, Results, StudyConfig, recorded, settings_of
 
+RESULTS = 'large.json'
 AREAS = {(16.0, 18.0): 0.2, (32.0, 36.0): 0.2, (64.0, 72.0): 0.3}
 """Sides, m, and the distance between images, m."""
 QUICK_AREAS = {(8.0, 8.0): 0.2}
@@ -35,12 +37,41 @@ KIDNAPPINGS, RIGHT_M = 6, 0.6
 """Number of kidnappings along the test drive, and the largest error of a recovered estimate."""
 
 
-def judge_areas(out: Path, config: StudyConfig, areas: dict[tuple[float, float], float]) -> str:
+def judge_areas(
+    out: Path, config: StudyConfig, areas: dict[tuple[float, float], float]
+) -> list[Cell]:
+    """The cells of the areas, by the name of the `garden`. Raises LocalizationError, also for a
+    folder with anything else.
+    """
+    settings = settings_of(config.world, config.seed, (), PANORAMA)
+    results = Results.opened(out / RESULTS, settings)
+    for area, every in areas.items():
+        if results.find(garden=_name(area)) is None:
+            results.keep(_judge(out, config, area, every))
+    return results.cells
+
+
+def _name(area: tuple[float, float]) -> str:
+    return f'{area[0]:g} m x {area[1]:g} m'
+
+
+def table(cells: Sequence[Cell]) -> str:
     """A line for each area as Markdown."""
-    cells = [_judge(out, config, area, every) for area, every in areas.items()]
-    lines = [list(cells[0]), ['---'] + ['---:'] * (len(cells[0]) - 1)]
-    lines += [[str(value) for value in cell.values()] for cell in cells]
-    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+    head = ['area', 'images; segments:', 'training (CPU s), memory (GB):', 'labels (m):',
+            'one image (m):', 'EKF, mean / p95 (m):', 'LOCALISED:', 'back after (s):']  # fmt: skip
+    rows = [
+        [
+            c['garden'],
+            f'{c["images"]:,}; {c["segments"]:,}',
+            f'{c["training_s"]}; {c["memory_gb"]:.1f}',
+            *(f'{c[name]:.3f}' for name in ('labels', 'sfa')),
+            f'{c["ekf"]:.3f} / {c["ekf_p95"]:.3f}',
+            f'{c["localised"]:.0%}',
+            f'{min(c["back_s"]):.1f} to {max(c["back_s"]):.1f}',
+        ]
+        for c in cells
+    ]
+    return markdown(head, rows)
 
 
 def _judge(out: Path, config: StudyConfig, area: tuple[float, float], every: float) -> Cell:
@@ -71,16 +102,17 @@ def _judge(out: Path, config: StudyConfig, area: tuple[float, float], every: flo
     ekf = score(run.ground_truth, moved(path, frame))
     back = list(_recoveries(model, run, seen, frame))
     return {
-        'garden': folder.name,
+        'garden': _name(area),
         'images': len(trained.runs[0].panoramas),
         'segments': len(trained.segments),
-        'training (CPU s)': round(seconds),
-        'memory (MB)': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
-        'labels (m)': f'{np.hypot(*(frame.apply(places) - truth).T).mean():.3f}',
-        'one image (m)': f'{score(run.ground_truth, moved(single, frame))["mean"]:.3f}',
-        'EKF, mean / p95 (m)': f'{ekf["mean"]:.3f} / {ekf["p95"]:.3f}',
-        'LOCALISED': f'{sure.mean():.0%}',
-        'back after (s)': ', '.join(f'{seconds:.1f}' for seconds in back),
+        'training_s': round(seconds),
+        'memory_gb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        'labels': float(np.hypot(*(frame.apply(places) - truth).T).mean()),
+        'sfa': score(run.ground_truth, moved(single, frame))['mean'],
+        'ekf': ekf['mean'],
+        'ekf_p95': ekf['p95'],
+        'localised': float(sure.mean()),
+        'back_s': back,
     }
 
 

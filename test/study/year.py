@@ -3,8 +3,8 @@
 """The study `year`: one garden, learned once, and a drive in each month after that.
 
 Each drive is judged before anything learns from it. The first model stays frozen; a copy of it is
-updated after each drive; in some months another is trained anew, on the first drive and the last.
-Bags, models and cells that are finished are used again when the command is repeated.
+updated after each drive. Bags, models and cells that are finished are used again when the command
+is repeated.
 """
 
 from __future__ import annotations
@@ -45,19 +45,18 @@ MONTHS = (
 
 @dataclass(frozen=True, slots=True)
 class YearPlan:
-    """Size of the garden (m) and of the panoramas, the months (1 to 12) before which a model is
-    trained anew, and about how many minutes it takes on two cores: measured for the quick one,
-    estimated by the number of pixels for the other.
+    """Size of the garden (m) and of the panoramas, the first months that are driven, and about how
+    many minutes it takes on two cores.
     """
 
     area: tuple[float, float]
     panorama: tuple[int, int]
-    retrained: tuple[int, ...]
+    months: int
     minutes: int
 
 
-YEAR = YearPlan((16.0, 18.0), (600, 60), tuple(range(2, 13)), 240)
-QUICK_YEAR = YearPlan((8.0, 8.0), (300, 30), (6, 11), 10)
+YEAR = YearPlan((8.0, 8.0), (300, 30), 12, 8)
+QUICK_YEAR = YearPlan((8.0, 8.0), (300, 30), 3, 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +85,12 @@ class _Work:
         )
         return recorded(bag, config, self.plan.panorama, self.progress)
 
-    def trained(self, name: str, *drives: int) -> PlaceModel:
-        """The model trained on some drives."""
-        path = self.out / f'{name}.npz'
+    def trained(self) -> PlaceModel:
+        """The model trained on the first drive."""
+        path = self.out / 'frozen.npz'
         if not path.exists():
-            bags = [self.drive(number) for number in drives]
             self.progress.say(f'train {path.name}')
-            train(bags, path, resume=True)
+            train([self.drive(0)], path, resume=True)
         return PlaceModel.load(path)
 
     def updated(self, model: PlaceModel, number: int) -> PlaceModel:
@@ -121,27 +119,21 @@ def judge_year(
     results = Results.opened(out / RESULTS, settings)
     report.say(f'this takes about {plan.minutes} minutes on two cores')
     _fill(_Work(out, config, plan, report), results)
-    save_text(out / 'year.md', table(results.cells) + '\n')
+    save_text(out / 'year.md', table(results.cells))
     report.say(f'see {out / "year.md"}')
     return results.cells
 
 
 def _fill(work: _Work, results: Results) -> None:
     """Judge the missing models, month by month."""
-    frozen = updated = work.trained('frozen', 0)
+    frozen = updated = work.trained()
     transform = None
-    for number, (month, light, season) in enumerate(MONTHS, 1):
-        models = {'frozen': frozen, 'updated': updated}
-        if number in work.plan.retrained:
-            models['retrained'] = work.trained(f'retrained_{number:02d}', 0, number - 1)
-        for name, model in models.items():
+    for number, (month, light, season) in enumerate(MONTHS[: work.plan.months], 1):
+        for name, model in {'frozen': frozen, 'updated': updated}.items():
             if results.find(model=name, month=month):
                 continue
             work.progress.say(f'{month}, {light}, {season}: {name}')
-            # The map of a model that was trained anew lies elsewhere.
-            given = None if name == 'retrained' else transform
-            scores, fitted = _judged(model, work.drive(number), work.drive(0), given)
-            transform = transform if name == 'retrained' else fitted
+            scores, transform = _judged(model, work.drive(number), work.drive(0), transform)
             names = {'model': name, 'month': month, 'light': light, 'season': season}
             results.keep({**names, **scores})
         updated = work.updated(updated, number)
