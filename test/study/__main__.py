@@ -117,16 +117,15 @@ def _paper(names: Sequence[str], out: Path, arguments: argparse.Namespace) -> No
 
 def _other(name: str, out: Path, arguments: argparse.Namespace) -> str:
     """Complete another study; return its table."""
-    config, quick = settings(StudyConfig, arguments), arguments.quick
+    config, quick, progress = settings(StudyConfig, arguments), arguments.quick, Progress(True)
     if name == 'light':
-        return light_report.table(light.fill_matrix(out, config, light.PLAN, progress=True))
+        return light_report.table(light.fill_matrix(out, config, progress))
     if name == 'rig':
         cases = rig.QUICK_CASES if quick else rig.CASES
-        cells = rig.judge_rigs(out, config, cases, Progress(shown=True))
-        return f'{rig.camera_table(cells)}\n{rig.ground_table(cells)}'
+        return rig.table(rig.judge_rigs(out, config, cases, progress))
     if name == 'year':
-        plan = year.QUICK_YEAR if quick else year.YEAR
-        return year_report.table(year.judge_year(out, config, plan, progress=True))
+        months = year.QUICK_MONTHS if quick else year.MONTHS
+        return year_report.table(year.judge_year(out, config, months, progress))
     areas = large.QUICK_AREAS if quick else large.AREAS
     return large.table(large.judge_areas(out, config, areas))
 

@@ -71,13 +71,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def table(cells: Sequence[Cell]) -> str:
     """A line for each cell as Markdown."""
-    head = ['images, place', 'trained on', 'tested on', 'one image (m):', 'inside:', 'EKF (m):',
-            'inside:', 'LOCALISED and wrong (s):']  # fmt: skip
+    head = ['images, place', 'tested on', 'one image (m):', 'EKF (m):', 'inside:']
     rows = [
         [
-            *(cell[name] for name in ('place', 'trained', 'tested')),
-            *(f'{cell[name]:.3f} | {cell[f"{name}_within"]:.0%}' for name in ('sfa', 'ekf')),
-            f'{cell["false_localised_s"]:.1f}',
+            *(cell[name] for name in ('place', 'tested')),
+            *(f'{cell[name]:.3f}' for name in ('sfa', 'ekf')),
+            f'{cell["ekf_within"]:.0%}',
         ]
         for cell in cells
     ]

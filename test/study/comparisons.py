@@ -29,11 +29,10 @@ from sfa_localization.place_model import PlaceModel, View
 from sfa_localization.sfa.network import standard_architecture
 from sfa_localization.sfa.network_training import ImageSequence, train_network
 from sfa_localization.sfa.settings import NetworkConfig
-from study.results import BATCH, Cell, Results
-from study.retrieval import ImageRetrieval
+from study.results import Cell, Results
 from study.signatures import FourierSignature
 from study.sites import Site, learned
-from study.trials import Features, Study, Trial, mean_error, scores_of, slow_of, turned_of
+from study.trials import Features, Study, Trial, scores_of, slow_of, turned_of
 
 BASELINES: dict[str, Callable[[Study, PlaceModel], Features]] = {
     'Fourier signatures of rows': lambda study, _model: (
@@ -42,15 +41,13 @@ BASELINES: dict[str, Callable[[Study, PlaceModel], Features]] = {
     'slow features, first pass': lambda _study, model: slow_of(model.network),
 }
 """Features that metric learning is given, of the images alone."""
-SECOND, WHOLE, RETRIEVAL = (
-    'turned maps, second pass', 'this package, one image', 'nearest image, at true positions',
-)  # fmt: skip
+SECOND, WHOLE = 'turned maps, second pass', 'this package, one image'
+FEATURES = (*BASELINES, SECOND, WHOLE)
 
 
 def baselines(site: Site, results: Results, world: str) -> None:
     """Add the cells of a world: errors in m, as `Trial.errors` names them, by `features`."""
-    names = (*BASELINES, SECOND, WHOLE, RETRIEVAL)
-    missing = [n for n in names if results.find(world=world, features=n) is None]
+    missing = [n for n in FEATURES if results.find(world=world, features=n) is None]
     if not missing:
         return
     study = site.study()
@@ -63,8 +60,6 @@ def baselines(site: Site, results: Results, world: str) -> None:
 def _judged(site: Site, study: Study, model: PlaceModel, name: str) -> Cell:
     """Errors of a kind of features, or the `problem` if they give no map."""
     rows = study.laid_on(SegmentConfig())
-    if name == RETRIEVAL:
-        return _retrieved(study)
     if name == WHOLE:
         judged = evaluate(model, site.test, align_bags=site.training, recipe=site.recipe)
         return {'test': judged.scores['sfa']['mean'], 'ekf': judged.scores['ekf']['mean']}
@@ -79,15 +74,6 @@ def _judged(site: Site, study: Study, model: PlaceModel, name: str) -> Cell:
     except LocalizationError as error:
         return {'problem': str(error)}
     return Trial.of(study, metric, features, rows, fitted).errors()
-
-
-def _retrieved(study: Study) -> Cell:
-    """Errors of the true position of the most similar training image."""
-    poses = np.column_stack([study.places, np.zeros(len(study.places))])
-    retrieval = ImageRetrieval.of((image for batch in study.batches() for image in batch), poses)
-    images = (i for batch in study.test.panoramas.batches(BATCH) for i in batch)
-    places = np.array([retrieval.locate(image)[:2] for image in images])
-    return {'test_supervised': mean_error(places, study.test_truth.poses[:, :2])}
 
 
 class SlowFeaturesAlone(PlaceModel):

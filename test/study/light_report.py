@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of a training by day that is tested in all lights and seasons, and of several gardens.
+"""Table of a training by day that is tested in all lights and seasons, in one or more gardens.
 
 A cell is a mapping with `trained`, `light` and `season`, and the scores that `light` gives; a score
 that does not exist is None or missing.
@@ -13,51 +13,35 @@ from typing import Any
 
 from page_tables import markdown
 
-from study.paper_report import number
+from study.paper_report import gardens, number
 
 Cells = Sequence[Mapping[str, Any]]
 
-
 MEASURES = {
-    "the paper's recipe (m):": ('paper', 'mean_m'),
+    "paper's recipe (m):": ('paper', 'mean_m'),
     'slow features alone (m):': ('slow', 'mean_m'),
     'one image (m):': ('sfa', 'mean_m'),
     'EKF (m):': ('ekf', 'mean_m'),
     'inside:': ('ekf', 'within_95'),
-    'LOCALISED and wrong (s):': ('false_localised_s',),
 }
 """Scores of a cell by their path."""
 
 
 def table(cells: Cells) -> str:
-    """The cells of one garden as a Markdown table, a line for each."""
-    rows = [
-        [condition(cell), *(number(value_of(cell, *path)) for path in MEASURES.values())]
-        for cell in by_day(cells)
-    ]
-    return markdown(['tested in', *MEASURES], rows)
-
-
-def by_day(cells: Cells) -> Cells:
-    """The cells of the training by day."""
-    return [cell for cell in cells if cell['trained'] == 'day']
-
-
-def gardens_table(cells: Cells) -> str:
-    """The range of the gardens `world` for each condition, trained by day."""
-    rows = []
-    for name in dict.fromkeys(map(condition, by_day(cells))):
-        same = [cell for cell in by_day(cells) if condition(cell) == name]
-        errors = [value_of(cell, 'ekf', 'mean_m') for cell in same]
-        inside = [value_of(cell, 'ekf', 'within_95') for cell in same]
-        texts = _range(errors, '{:.3f}'), _range(inside, '{:.0%}')
-        rows.append([name, str(len(same)), *texts])
-    return markdown(['tested in', 'gardens:', 'EKF (m):', 'inside:'], rows)
-
-
-def _range(values: Sequence[float | None], form: str) -> str:
-    finite = [value for value in values if value is not None]
-    return f'{form.format(min(finite))} to {form.format(max(finite))}' if finite else '-'
+    """A line for each condition as Markdown: the scores in the first garden, and the range of the
+    filter's errors in all gardens `world`.
+    """
+    rows, first = [], min(cell.get('world', 0) for cell in cells)
+    for name in dict.fromkeys(map(condition, cells)):
+        same = [cell for cell in cells if condition(cell) == name]
+        errors = [e for cell in same if (e := value_of(cell, 'ekf', 'mean_m')) is not None]
+        extent = f'{min(errors):.3f}-{max(errors):.3f}' if errors else '-'
+        for cell in same:
+            if cell.get('world', 0) == first:
+                values = (number(value_of(cell, *path)) for path in MEASURES.values())
+                rows.append([name, *values, extent])
+    worlds = gardens(len({cell.get('world') for cell in cells}))
+    return markdown(['tested in', *MEASURES, f'EKF in {worlds} (m):'], rows)
 
 
 def condition(cell: Mapping[str, Any]) -> str:

@@ -25,8 +25,7 @@ from sfa_localization import __version__
 from sfa_localization.commands.demo import MARKER
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.files import atomic_write
-from sfa_localization.reports.evaluation import LABELS, YAW_COLUMNS
-from sfa_localization.reports.evaluation import tables as scores_tables
+from sfa_localization.reports.evaluation import tables as tables_of
 from sfa_localization.reports.figures import save_text
 from study import bags, large, light, light_report, overview, rig, year, year_report
 from study import tables as paper_tables
@@ -36,24 +35,19 @@ from study.sites import FULL, ROUTES
 
 SUMMARY = 'put the results in these folders onto the pages'
 TESTS = Path(__file__).parents[1]
-README, RECORD, PAGE = (
-    TESTS.parent / 'README.md',
-    TESTS / 'reproduced.json',
-    TESTS / 'EVALUATION.md',
-)
-FIGURES = TESTS / 'figures'
+README, PAGE = TESTS.parent / 'README.md', TESTS / 'EVALUATION.md'
+RECORD, FIGURES = TESTS / 'reproduced.json', TESTS / 'figures'
 FILES = {
     **{f'{name}.json': name for name in paper_tables.NAMES},
     light.RESULTS: 'light', year.RESULTS: 'year', large.RESULTS: 'large', rig.RESULTS: 'rig',
-    bags.RESULTS: 'bags', 'real.json': 'real', 'results.json': 'drives',
+    bags.RESULTS: 'bags', 'real.json': 'real', MARKER: 'demo',
 }  # fmt: skip
-"""Results by their files; real.json is of benchmarks/bench_real.py, results.json of the demo."""
+"""Results by their files; real.json is of benchmarks/bench_real.py."""
 NAMES = (
     'world', 'seed', 'features', 'variant', 'trained', 'light', 'season', 'model', 'month',
-    'garden', 'case', 'slope', 'place', 'tested', 'points', 'log', 'drive', 'estimate',
+    'garden', 'case', 'slope', 'place', 'tested', 'log',
 )  # fmt: skip
 """What tells the cells of a result apart."""
-DRIVES = 'odometry', 'sfa', 'ekf'
 UNMEASURED = 'Not measured with this version yet.\n'
 Record = dict[str, Any]
 
@@ -85,8 +79,8 @@ def update(folders: Sequence[Path]) -> int:
         write_table(name, text or UNMEASURED, PAGE)
     for page in (README, TESTS / 'README.md', PAGE):
         write_table('version', dated(record), page)
-    for (page, name), text in drives(record['results'].get('drives', [])).items():
-        write_table(name, text, page)
+    if demo := record['results'].get('demo'):
+        write_table('demo', tables_of(demo[0]).partition('\n\n')[0] + '\n', README)
     return 0
 
 
@@ -100,8 +94,8 @@ def _add(record: Record, file: Path) -> None:
     they are of the paper's experiments.
     """
     name, content = FILES[file.name], json.loads(file.read_text('utf-8'))
-    if name == 'drives':
-        content = _of_drive(file, content)
+    if name == 'demo':
+        content = {'settings': content, 'cells': [_of_demo(file.with_name('results.json'))]}
     settings, cells = content['settings'], content['cells']
     if settings['version'] != __version__:
         raise ConfigError(
@@ -113,7 +107,7 @@ def _add(record: Record, file: Path) -> None:
             record['quick'][name] = _rounded({c: columns[c] for c in (*RECIPES, 'ours')})
         return
     if name == 'light':
-        cells = [{'world': settings['world'], **cell} for cell in cells]
+        cells = [{'world': settings['world'], **c} for c in cells if c['trained'] == light.TRAINED]
     kept = {_names(cell): cell for cell in [*record['results'].get(name, []), *cells]}
     record['results'][name] = _rounded([*kept.values()])
     if name in ROUTES:
@@ -127,18 +121,12 @@ def _shrink(figure: Path, target: Path) -> None:
         image.convert('RGB').quantize().save(file, 'PNG', optimize=True)
 
 
-def _of_drive(file: Path, scores: Mapping[str, Any]) -> Record:
-    """The errors of the demo, or of another drive that `evaluate --json` has judged."""
-    marker, version = file.with_name(MARKER), __version__
-    if marker.exists():
-        version = json.loads(marker.read_text('utf-8'))['version']
-    drive = 'demo' if marker.exists() else 'recordings'
-    columns = 'mean', 'median', 'p95', 'rmse', 'max', 'n', 'yaw_deg'
-    cells = [
-        {'drive': drive, 'estimate': name, **{column: scores[name][column] for column in columns}}
-        for name in DRIVES
-    ]
-    return {'settings': {'version': version}, 'cells': cells}
+def _of_demo(file: Path) -> Cell:
+    """The errors of the demo, of the rows of its table."""
+    if not file.exists():
+        raise ConfigError(f'{file}: is missing: complete the demo')
+    scores = json.loads(file.read_text('utf-8'))
+    return {name: scores[name] for name in ('odometry', 'sfa', 'ekf')}
 
 
 def _names(cell: Cell) -> tuple[Any, ...]:
@@ -173,22 +161,12 @@ def _lines(parts: Iterable[str]) -> str:
 
 def tables(results: Mapping[str, Sequence[Cell]]) -> dict[str, str]:
     """The tables of the page by their names, '' where there are no cells."""
-    one_garden = [c for c in results.get('light', []) if c['world'] == overview.WORLD]
-    made = {
+    makers = {
         **{name: partial(paper_tables.table, name) for name in paper_tables.NAMES},
-        'year': year_report.table, 'large': large.table, 'bags': bags.table, 'real': real_table,
+        'light': light_report.table, 'rig': rig.table, 'year': year_report.table,
+        'large': large.table, 'bags': bags.table, 'real': real_table,
     }  # fmt: skip
-    texts = {
-        name: table(results[name]) if results.get(name) else '' for name, table in made.items()
-    }
-    rigs = results.get('rig', [])
-    return {
-        **texts,
-        'light': light_report.table(one_garden) if one_garden else '',
-        'gardens': light_report.gardens_table(results['light']) if one_garden else '',
-        'camera': rig.camera_table(rigs) if rigs else '',
-        'ground': rig.ground_table(rigs) if rigs else '',
-    }
+    return {name: make(results[name]) if results.get(name) else '' for name, make in makers.items()}
 
 
 def figures(results: Mapping[str, Sequence[Cell]]) -> dict[str, str]:
@@ -203,38 +181,11 @@ def figures(results: Mapping[str, Sequence[Cell]]) -> dict[str, str]:
     return texts
 
 
-def drives(cells: Sequence[Cell]) -> dict[tuple[Path, str], str]:
-    """The table of the demo for the README, and that of all drives for test/README.md."""
-    demo = {c['estimate']: c for c in cells if c['drive'] == 'demo'}
-    if not demo:
-        return {}
-    rows = [
-        [
-            f'{c["drive"]}: {LABELS[c["estimate"]]}',
-            *(f'{c[column]:.3f}' for column in ('mean', 'median', 'p95', 'max')),
-            *(f'{c["yaw_deg"][column]:.2f}' for column in YAW_COLUMNS),
-        ]
-        for c in cells
-    ]
-    head = ['drive, estimate', 'position: mean:', 'median:', 'p95:', 'max (m):', 'heading: mean:',
-            'median:', 'p95 (°):']  # fmt: skip
-    return {
-        (README, 'demo'): scores_tables(demo).partition('\n\n')[0] + '\n',
-        (TESTS / 'README.md', 'accuracy'): markdown(head, rows),
-    }
-
-
 def real_table(cells: Sequence[Cell]) -> str:
-    """The filter beside a plain EKF on each log."""
-    head = ['log', 'plain EKF (m):', '`filter` (m):', 'in the 95 % ellipse, plain / `filter`:',
-            'heading within 95 %, plain / `filter`:', 'good positions rejected:']  # fmt: skip
+    """The plain EKF and the filter on each log."""
     rows = []
     for cell in cells:
         pair = cell['plain'], cell['ours']
-        inside = (
-            ' / '.join(f'{part[name]:.0%}' for part in pair)
-            for name in ('xy_within_95', 'yaw_within_95')
-        )
-        errors = (f'{part["error_m"]:.3f}' for part in pair)
-        rows.append([cell['log'], *errors, *inside, f'{pair[1]["good_rejected"]:.1%}'])
-    return markdown(head, rows)
+        scores = [(f'{one["error_m"]:.3f}', f'{one["xy_within_95"]:.0%}') for one in pair]
+        rows.append([cell['log'], *scores[0], *scores[1]])
+    return markdown(['log', 'plain EKF (m):', 'inside:', '`filter` (m):', 'inside:'], rows)

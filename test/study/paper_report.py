@@ -73,7 +73,7 @@ def paper_table(name: str, cells: Cells) -> str:
 def _of_paper(name: str, row: str) -> str:
     numbers = PAPER[name]
     if row == 'gain' and 'odometry' in numbers:
-        return f'{100 * (numbers["ekf"] / numbers["odometry"] - 1):.0f} %'
+        return f'{100 * (numbers["ekf"] / numbers["odometry"] - 1):.0f}%'
     return f'{numbers[row]:.2f}' if row in numbers else _UNKNOWN
 
 
@@ -93,40 +93,33 @@ def values_of(cells: Cells, column: str, row: str) -> list[float]:
 def _text(row: str, values: Sequence[float]) -> str:
     if not values:
         return _UNKNOWN
-    digits, unit = (0, ' %') if row == 'gain' else (3, '')
-    spread = f' ± {np.std(values, ddof=1):.{digits}f}' if len(values) > 1 else ''
+    digits, unit = (0, '%') if row == 'gain' else (3, '')
+    spread = f'±{np.std(values, ddof=1):.{digits}f}' if len(values) > 1 else ''
     return f'{np.mean(values):.{digits}f}{spread}{unit}'
 
 
 def baselines_table(cells: Cells) -> str:
-    """A line for each kind of features, a column for each world: test / supervised (m)."""
+    """A line for each kind of features, a column for each world: test/supervised (m)."""
     worlds = list(dict.fromkeys(str(cell['world']) for cell in cells))
     rows = []
     for name in dict.fromkeys(str(cell['features']) for cell in cells):
         same = {str(cell['world']): cell for cell in cells if cell['features'] == name}
         pairs = [[same.get(w, {}).get(m) for m in ('test', 'test_supervised')] for w in worlds]
-        rows.append([name, *(' / '.join(map(number, pair)) for pair in pairs)])
-    return markdown(['features, test / supervised (m)', *(f'{w}:' for w in worlds)], rows)
+        rows.append([name, *('/'.join(map(number, pair)) for pair in pairs)])
+    return markdown(['features, test/supervised (m)', *(f'{w}:' for w in worlds)], rows)
 
 
-def scores_table(cells: Cells, label: str, more: Mapping[str, tuple[str, str]]) -> str:
-    """A line for each cell of `scores_of`, named by its `label`; `more` columns have a title and a
-    format by the name of their number.
-    """
-    titles = [
-        'one image (m):',
-        'squared error / variance:',
-        'EKF (m):',
-        'squared error / variance:',
-    ]
-    scores = dict.fromkeys(('sfa', 'sfa_nees', 'ekf', 'ekf_nees'), '{:.3f}')
-    scores |= {'sfa_nees': '{:.2f}', 'ekf_nees': '{:.2f}'}
-    scores |= {name: form for name, (_, form) in more.items()}
+def ablations_table(cells: Cells) -> str:
+    """A line for each variant."""
+    forms = {
+        'sfa': '{:.3f}', 'sfa_nees': '{:.2f}', 'ekf': '{:.3f}', 'ekf_nees': '{:.2f}',
+        'heading': '{:.2f}',
+    }  # fmt: skip
     rows = [
-        [str(cell[label]), *(number(cell.get(name), form) for name, form in scores.items())]
-        for cell in cells
+        [c['variant'], *(number(c.get(name), form) for name, form in forms.items())] for c in cells
     ]
-    return markdown([label, *titles, *(title for title, _ in more.values())], rows)
+    head = ['variant', 'one image (m):', 'ratio:', 'EKF (m):', 'ratio:', 'EKF heading (°):']
+    return markdown(head, rows)
 
 
 def gardens(count: int) -> str:

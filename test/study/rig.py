@@ -20,16 +20,14 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.evaluation import evaluate
 from sfa_localization.metric.settings import MetricConfig
-from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation.drive import SimulatedDrive, drive, record
 from sfa_localization.simulation.garden import Garden
-from sfa_localization.simulation.settings import SimulationConfig
-from sfa_localization.training import Recipe, train
-from study.results import Cell, Progress, Results, StudyConfig, settings_of, usual_drift
+from sfa_localization.training import Recipe
+from study.results import Cell, Progress, Results, StudyConfig
+from study.sites import SMALL_PANORAMA, SmallGarden
 from study.trials import scores_of
 
 RESULTS = 'rig.json'
-AREA, PANORAMA = (8.0, 8.0), (300, 30)
 AHEAD = 0.3
 """Of the camera, m, from the axle: on many small robots."""
 SLOPES = (0.0, 1.0, 2.0, 4.0)
@@ -69,33 +67,22 @@ CASES = {
 QUICK_CASES = {'0.3 m ahead, learned': CASES['0.3 m ahead, learned']}
 
 
-def camera_table(cells: Sequence[Cell]) -> str:
+def table(cells: Sequence[Cell]) -> str:
     """The places of the camera on flat ground: means over the gardens, as Markdown."""
     rows = []
     for name in CASES:
         same = [c for c in cells if c['case'] == name and c['slope'] == 0.0]
         if same and name != UNEVEN:
             rows.append([name, *(form.format(_mean(same, n)) for n, form in FORMS.items())])
-    head = ['camera', 'place by the training (m):', 'one image (m):', 'squared error / variance:',
-            'EKF (m):', 'squared error / variance:']  # fmt: skip
+    head = [
+        'camera',
+        'place by the training (m):',
+        'one image (m):',
+        'ratio:',
+        'EKF (m):',
+        'ratio:',
+    ]
     return markdown(head, rows)
-
-
-def ground_table(cells: Sequence[Cell]) -> str:
-    """One image (m) / EKF (m) / inside, by the slopes of training and test, as Markdown."""
-    rows = []
-    for slope in SLOPES:
-        same = [
-            [c for c in cells if (c['case'], c['slope']) == (n, slope)] for n in (ABOVE, UNEVEN)
-        ]
-        texts = [_three(part) if part else '-' for part in same]
-        rows.append([f'{slope:g} degrees' if slope else 'flat', *texts])
-    return markdown(['one image / EKF (m) / inside', 'trained flat:', f'{UNEVEN}:'], rows)
-
-
-def _three(cells: Sequence[Cell]) -> str:
-    means = (_mean(cells, name) for name in ('sfa', 'ekf', 'ekf_within'))
-    return '{:.3f} / {:.3f} / {:.0%}'.format(*means)
 
 
 def _mean(cells: Sequence[Cell], name: str) -> float:
@@ -119,64 +106,43 @@ def judge_rigs(
 
     Raises LocalizationError, also for a folder with anything else.
     """
-    settings = settings_of(config.world, config.seed, AREA, PANORAMA)
-    results = Results.opened(out / RESULTS, settings)
+    results = SmallGarden.results(out / RESULTS, config)
     for number in range(config.seeds):
-        world = config.world + number
+        world, seed = config.world + number, config.seed + number
+        garden = SmallGarden(out / f'garden_{world}', world, seed, progress)
         for name, case in cases.items():
             names = [{'world': world, 'case': name, 'slope': slope} for slope in case.tested]
             missing = [cell for cell in names if results.find(**cell) is None]
             if missing:
-                garden = _Garden(out / f'garden_{world}', world, config.seed + number, progress)
-                garden.judge(case, missing, results)
+                _judge(garden, case, missing, results)
     return results.cells
 
 
-@dataclass(frozen=True, slots=True)
-class _Garden:
-    """A garden with its bags and models in a folder."""
+def _judge(garden: SmallGarden, case: Case, missing: Sequence[Cell], results: Results) -> None:
+    """Train once, and add the missing cells."""
+    training = _bag(garden, 'coverage', case.ahead, case.slope)
+    told = ''.join(f'_{meters:g}' for meters in case.told)
+    recipe = Recipe(metric=MetricConfig(camera_xy=case.told))
+    model, transform = garden.model(f'{training.name}{told}', training, recipe), None
+    for names in missing:
+        garden.progress.say(f'garden {garden.world}, {names["case"]}, slope {names["slope"]:g}')
+        bag = _bag(garden, 'test', case.ahead, names['slope'])
+        align = () if transform else (training,)
+        judged = evaluate(model, bag, align_bags=align, transform=transform)
+        transform = judged.transform
+        results.keep({**names, 'ahead': model.rig.lever.real, **scores_of(judged)})
 
-    folder: Path
-    world: int
-    seed: int
-    progress: Progress
 
-    def judge(self, case: Case, missing: Sequence[Cell], results: Results) -> None:
-        """Train once, and add the missing cells."""
-        training = self._bag('coverage', case.ahead, case.slope)
-        model, transform = self._model(case, training), None
-        for names in missing:
-            self.progress.say(f'garden {self.world}, {names["case"]}, slope {names["slope"]:g}')
-            bag = self._bag('test', case.ahead, names['slope'])
-            align = () if transform else (training,)
-            judged = evaluate(model, bag, align_bags=align, transform=transform)
-            transform = judged.transform
-            results.keep({**names, 'ahead': model.rig.lever.real, **scores_of(judged)})
-
-    def _model(self, case: Case, training: Path) -> PlaceModel:
-        told = ''.join(f'_{meters:g}' for meters in case.told)
-        path = self.folder / f'{training.name}{told}.npz'
-        if not path.exists():
-            self.progress.say(f'garden {self.world}: train {path.name}')
-            train([training], path, Recipe(metric=MetricConfig(camera_xy=case.told)), resume=True)
-        return PlaceModel.load(path)
-
-    def _bag(self, route: str, ahead: float, slope: float) -> Path:
-        bag = self.folder / f'{route}_{ahead:g}_{slope:g}'
-        if bag.exists():
-            return bag
-        self.progress.say(f'garden {self.world}: simulate {bag.name}')
-        width, height = PANORAMA
-        config = SimulationConfig(
-            trajectory=route, world=self.world, seed=self.seed + (route == 'coverage'), area=AREA,
-            test_drift=usual_drift(AREA), terrain=slope, images='panorama', compression='jpeg',
-        )  # fmt: skip
-        garden = Garden(config.world, config)
-        driven = drive(garden, config)
-        if ahead:
-            driven = CameraAhead(
-                driven.truth, driven.odometry, driven.yaw_rate, driven.image_stamps_ns
-            )
-        size = PanoramaConfig(width=width, height=height)
-        record(driven, garden, config, bag, size, self.progress.shown)
-        return bag
+def _bag(garden: SmallGarden, route: str, ahead: float, slope: float) -> Path:
+    """The bag of a drive, simulated if it is missing."""
+    name, number = f'{route}_{ahead:g}_{slope:g}', int(route == 'coverage')
+    if not ahead or (garden.folder / name).exists():
+        return garden.drive(name, number, trajectory=route, terrain=slope)
+    garden.progress.say(f'simulate {name}')
+    config = garden.config(number, trajectory=route, terrain=slope)
+    world = Garden(config.world, config)
+    driven = drive(world, config)
+    driven = CameraAhead(driven.truth, driven.odometry, driven.yaw_rate, driven.image_stamps_ns)
+    width, height = SMALL_PANORAMA
+    record(driven, world, config, garden.folder / name, PanoramaConfig(width=width, height=height))
+    return garden.folder / name

@@ -11,14 +11,13 @@ from pathlib import Path
 
 from sfa_localization.reports.figures import save_text
 from sfa_localization.training import Recipe
-from study.comparisons import VARIANTS, ablations, baselines
+from study.comparisons import FEATURES, VARIANTS, ablations, baselines
 from study.paper import experiment
-from study.paper_report import Cells, baselines_table, paper_table, scores_table
+from study.paper_report import Cells, ablations_table, baselines_table, paper_table
 from study.results import Progress, Results, StudyConfig, settings_of
 from study.sites import ROUTES, Site, SitePlan
 
 NAMES = ('simulator', 'robot', 'baselines', 'ablations')
-HEADING = {'heading': ('EKF heading (°):', '{:.2f}')}
 
 
 def table(name: str, cells: Cells) -> str:
@@ -26,9 +25,8 @@ def table(name: str, cells: Cells) -> str:
     if name in ROUTES:
         return paper_table(name, cells)
     if name == 'baselines':
-        return baselines_table(cells)
-    ordered = [c for variant in VARIANTS for c in cells if c['variant'] == variant]
-    return scores_table(ordered, 'variant', HEADING)
+        return baselines_table([cell for cell in cells if cell['features'] in FEATURES])
+    return ablations_table([c for variant in VARIANTS for c in cells if c['variant'] == variant])
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,11 +16,7 @@ from page_tables import markdown
 
 Cells = Sequence[Mapping[str, Any]]
 MODELS = {'frozen': 'never updated:', 'updated': 'updated each month:'}
-MEASURES = {
-    'ekf_m': 'EKF (m)',
-    'sfa_m': 'one image (m)',
-    'false_localised_s': 'LOCALISED, wrong (s)',
-}
+MEASURES = {'ekf_m': 'EKF', 'sfa_m': 'one image'}
 
 
 def table(cells: Cells) -> str:
@@ -28,7 +24,6 @@ def table(cells: Cells) -> str:
     rows = []
     for name, title in MEASURES.items():
         values = [[c.get(name, np.nan) for c in cells if c['model'] == m] for m in MODELS]
-        for word, of in (('mean', np.mean), ('worst', np.max)):
-            texts = [f'{of(v):.3f}' if v else '-' for v in values]
-            rows.append([f'{title}, {word} of the months', *texts])
-    return markdown(['measure', *MODELS.values()], rows)
+        for word, of in (('mean', np.nanmean), ('worst', np.nanmax)):
+            rows.append([f'{title}, {word} month', *(f'{of(months):.3f}' for months in values)])
+    return markdown(['error (m)', *MODELS.values()], rows)
