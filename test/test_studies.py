@@ -3,6 +3,7 @@
 """Each study, tiny: it ends, what is finished is kept, and its numbers are plausible."""
 
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
 from unittest import mock
@@ -10,13 +11,14 @@ from unittest import mock
 import numpy as np
 import pytest
 from study import __main__ as studies
-from study import comparisons, light, results, sites, year
+from study import comparisons, light, page, results, sites, year
 from study.comparisons import BASELINES, VARIANTS
 from study.half_real import given_drive
 from study.results import Results
 from study.sites import SitePlan
 from study.tables import NAMES
 
+from sfa_localization import __version__
 from sfa_localization.bags.drives import read_drive
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.run import Odometry, Trajectory
@@ -101,6 +103,27 @@ def test_a_foreign_folder_and_results_of_other_settings_are_left_alone(tmp_path)
         with pytest.raises(LocalizationError, match='--out'):
             Results.opened(folder / name, {'world': 2}, ('robot.json',))
     assert Results.opened(folder / 'robot.json', {'world': 1}).find(seed=3) == {'seed': 3}
+
+
+def test_results_come_onto_the_page_once_and_only_of_this_version(tmp_path, monkeypatch):
+    for name in ('README', 'PAGE', 'RECORD'):
+        source = getattr(page, name)
+        monkeypatch.setattr(page, name, shutil.copy(source, tmp_path / f'{name}{source.suffix}'))
+    shutil.copy(page.TESTS / 'README.md', tmp_path)
+    monkeypatch.setattr(page, 'TESTS', tmp_path)
+    monkeypatch.setattr(page, 'FIGURES', tmp_path)
+    cell = {'log': 'a drive', 'plain': {'error_m': 0.0625, 'xy_within_95': 0.5}}
+    cell['ours'] = {**cell['plain'], 'error_m': 0.03125}
+    for version, code in ((__version__, 0), (__version__, 0), ('0.0.1', 1)):
+        results.write_json(
+            tmp_path / 'real/real.json', {'settings': {'version': version}, 'cells': [cell]}
+        )
+        assert studies.main(['page', str(tmp_path / 'real')]) == code
+        assert page.PAGE.read_text('utf-8').count('| a drive | 0.062 | 50% | 0.031 | 50% |') == 1
+        kept = json.loads(page.RECORD.read_text('utf-8'))['results']['real']
+        assert [other['log'] for other in kept].count('a drive') == 1
+    (tmp_path / 'empty').mkdir()
+    assert studies.main(['page', str(tmp_path / 'empty')]) == 1
 
 
 def circle():
