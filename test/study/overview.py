@@ -25,8 +25,7 @@ COLORS = {
     'one image, trained on slopes': '#F0E442', 'EKF, trained on slopes': '#D55E00',
 }  # fmt: skip
 """Of Okabe and Ito, as in all reports."""
-WORLD = 1
-"""The garden of the table of lights; the others show how gardens differ."""
+ESTIMATES = "paper's recipe", 'slow features alone', 'one image', 'EKF'
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,24 +84,19 @@ def paper(results: Mapping[str, Cells]) -> tuple[list[Panel], str]:
 
 def lights(results: Mapping[str, Cells]) -> tuple[list[Panel], str]:
     """Trained by day, tested in each light and season."""
-    by_day = [cell for cell in results['light'] if cell['trained'] == 'day']
-    here = [cell for cell in by_day if cell['world'] == WORLD]
-    names = {
-        "paper's recipe": 'paper',
-        'slow features alone': 'slow',
-        'one image': 'sfa',
-        'EKF': 'ekf',
-    }
+    cells = results['light']
+    worlds = {cell['world'] for cell in cells}
+    here = [cell for cell in cells if cell['world'] == min(worlds)]
+    names = dict(zip(ESTIMATES, ('paper', 'slow', 'sfa', 'ekf'), strict=True))
     series = {
         title: [_number(value_of(cell, name, 'mean_m')) for cell in here]
         for title, name in names.items()
     }
     groups = [condition(cell).replace(', ', '\n') for cell in here]
-    errors = [_number(value_of(cell, 'ekf', 'mean_m')) for cell in by_day]
-    wrong = sum(cell.get('false_localised_s', 0.0) for cell in by_day)
-    worlds = len({cell['world'] for cell in by_day})
+    errors = [_number(value_of(cell, 'ekf', 'mean_m')) for cell in cells]
+    wrong = sum(cell.get('false_localised_s', 0.0) for cell in cells)
     return [Panel('trained by day in summer', groups, series)], (
-        f'**Light and season**, rendered, {gardens(worlds)}: trained by day in summer, the filter '
+        f'**Light and season**, rendered, {gardens(len(worlds))}: trained by day in summer, the filter '
         f'errs by {np.nanmin(errors):.2f} to {np.nanmax(errors):.2f} m in every light and season, '
         f'and was LOCALISED and wrong for {wrong:.0f} s.'
     )
@@ -118,9 +112,9 @@ def ground(results: Mapping[str, Cells]) -> tuple[list[Panel], str]:
     groups = ['flat' if not slope else f'{slope:g}°' for slope in SLOPES]
     image, ekf = series['one image'], series['EKF']
     return [Panel('standard deviation of the slope', groups, series)], (
-        f'**Uneven ground**, rendered: trained on flat ground, one image errs by {image[0]:.2f} m '
-        f'there and by {max(image):.2f} m on slopes, the filter by {ekf[0]:.2f} and '
-        f'{max(ekf):.2f} m.'
+        f'**Uneven ground**, rendered, {_gardens(results)}: trained on flat ground, one image errs '
+        f'by {image[0]:.2f} m there and by {max(image):.2f} m on slopes, the filter by '
+        f'{ekf[0]:.2f} and {max(ekf):.2f} m.'
     )
 
 
@@ -147,10 +141,15 @@ def camera(results: Mapping[str, Cells]) -> tuple[list[Panel], str]:
     _, measured, learned, ignored = series['EKF']
     groups = [case.replace(', ', '\n') for case in cases]
     return [Panel('place of the camera, and what the training knew of it', groups, series)], (
-        f'**Camera beside the axle**, rendered: with a camera 0.3 m ahead the filter errs by '
-        f'{learned:.2f} m where the training learned its place, {measured:.2f} m where it was '
+        f'**Camera beside the axle**, rendered, {_gardens(results)}: 0.3 m ahead, the filter errs '
+        f'by {learned:.2f} m where the training learned its place, {measured:.2f} m where it was '
         f'measured, {ignored:.2f} m where it was ignored.'
     )
+
+
+def _gardens(results: Mapping[str, Cells]) -> str:
+    """Number of gardens of the study `rig`."""
+    return gardens(len({cell['world'] for cell in results['rig']}))
 
 
 def _of_rig(results: Mapping[str, Cells], case: str, slope: float, name: str) -> float:

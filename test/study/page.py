@@ -48,6 +48,14 @@ NAMES = (
     'garden', 'case', 'slope', 'place', 'tested', 'log',
 )  # fmt: skip
 """What tells the cells of a result apart."""
+PICTURES = {
+    'simulator': {
+        'Figure 4': 'figure_4', 'Figure 5': 'figure_5', 'Figure 6': 'figure_6',
+        'Figure 1d': 'figure_1d_simulator',
+    },
+    'robot': {'Figure 7': 'figure_7', 'Figure 8': 'figure_8', 'Figure 9': 'figure_9'},
+}  # fmt: skip
+"""Of the paper's experiments, below their tables."""
 UNMEASURED = 'Not measured with this version yet.\n'
 Record = dict[str, Any]
 
@@ -93,10 +101,7 @@ def _add(record: Record, file: Path) -> None:
     """Add the cells of a file. Those of a small garden are kept for test_reproduce_quick.py, if
     they are of the paper's experiments.
     """
-    name, content = FILES[file.name], json.loads(file.read_text('utf-8'))
-    if name == 'demo':
-        content = {'settings': content, 'cells': [_of_demo(file.with_name('results.json'))]}
-    settings, cells = content['settings'], content['cells']
+    name, (settings, cells) = FILES[file.name], _read(file)
     if settings['version'] != __version__:
         raise ConfigError(
             f'{file}: is of version {settings["version"]}, not {__version__}: repeat the study'
@@ -121,12 +126,16 @@ def _shrink(figure: Path, target: Path) -> None:
         image.convert('RGB').quantize().save(file, 'PNG', optimize=True)
 
 
-def _of_demo(file: Path) -> Cell:
-    """The errors of the demo, of the rows of its table."""
-    if not file.exists():
-        raise ConfigError(f'{file}: is missing: complete the demo')
-    scores = json.loads(file.read_text('utf-8'))
-    return {name: scores[name] for name in ('odometry', 'sfa', 'ekf')}
+def _read(file: Path) -> tuple[Record, list[Cell]]:
+    """Settings and cells of a study, or of the demo: its cell has the rows of its table."""
+    try:
+        content = json.loads(file.read_text('utf-8'))
+        if file.name != MARKER:
+            return dict(content['settings']), list(content['cells'])
+        scores = json.loads(file.with_name('results.json').read_text('utf-8'))
+        return content, [{name: scores[name] for name in ('odometry', 'sfa', 'ekf')}]
+    except (OSError, ValueError, LookupError, TypeError):
+        raise ConfigError(f'{file}: not the results of a study or a complete demo') from None
 
 
 def _names(cell: Cell) -> tuple[Any, ...]:
@@ -166,7 +175,13 @@ def tables(results: Mapping[str, Sequence[Cell]]) -> dict[str, str]:
         'light': light_report.table, 'rig': rig.table, 'year': year_report.table,
         'large': large.table, 'bags': bags.table, 'real': real_table,
     }  # fmt: skip
-    return {name: make(results[name]) if results.get(name) else '' for name, make in makers.items()}
+    texts = {
+        name: make(results[name]) if results.get(name) else '' for name, make in makers.items()
+    }
+    for name in PICTURES.keys() & {name for name, text in texts.items() if text}:
+        pictures = (f'![{title}](figures/{file}.png)\n' for title, file in PICTURES[name].items())
+        texts[name] += '\n' + ''.join(pictures)
+    return texts
 
 
 def figures(results: Mapping[str, Sequence[Cell]]) -> dict[str, str]:
