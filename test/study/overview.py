@@ -96,9 +96,9 @@ def lights(results: Mapping[str, Cells]) -> tuple[list[Panel], str]:
     errors = [_number(value_of(cell, 'ekf', 'mean_m')) for cell in cells]
     wrong = sum(cell.get('false_localised_s', 0.0) for cell in cells)
     return [Panel('trained by day in summer', groups, series)], (
-        f'**Light and season**, rendered, {gardens(len(worlds))}: trained by day in summer, the filter '
-        f'errs by {np.nanmin(errors):.2f} to {np.nanmax(errors):.2f} m in every light and season, '
-        f'and was LOCALISED and wrong for {wrong:.0f} s.'
+        f'**Light and season**, rendered, {gardens(len(worlds))}: trained by day in summer, the '
+        f'filter errs by {np.nanmin(errors):.2f} to {np.nanmax(errors):.2f} m in all lights and '
+        f'seasons, and was LOCALISED and wrong for {wrong:.0f} s.'
     )
 
 
