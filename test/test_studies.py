@@ -84,7 +84,7 @@ def test_lights_and_months_are_judged_before_anything_is_learned(made):
 
 @pytest.mark.study
 def test_what_is_finished_is_not_made_again(made, monkeypatch, capsys):
-    for module, step in ((results, 'simulate'), (light, 'evaluate'), (year, 'evaluate'),
+    for module, step in ((results, 'simulate'), (light, 'evaluate'), (sites, 'train'),
                          (comparisons, 'evaluate')):  # fmt: skip
         monkeypatch.setattr(module, step, mock.Mock(side_effect=AssertionError))
     made_in(made)
