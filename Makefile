@@ -25,10 +25,10 @@ $(READY): setup.py .ci/env
 demo: $(READY)  ## simulate, train, run the three nodes live, print the errors (about 5 minutes)
 	$(PY) -m sfa_localization demo $(ARGS)
 
-reproduce: $(READY)  ## the tables and figures of test/EVALUATION.md: hours, which go on where they ended (ARGS=--quick)
+reproduce: $(READY)  ## the studies and the page test/EVALUATION.md: hours, which go on where they ended (ARGS=--quick)
 	PYTHONPATH=.:test $(PY) -m study all $(ARGS)
 
-study: $(READY)  ## one of these studies, a year, or half-real bags (ARGS='baselines --quick'; ARGS=--help)
+study: $(READY)  ## one of these studies, given or half-real bags, or the page (ARGS='baselines --quick'; ARGS=--help)
 	PYTHONPATH=.:test $(PY) -m study $(ARGS)
 
 test: $(READY)  ## run the tests, several files at once (ARGS='-k bag' for some of them, '-m study' for those of the studies)

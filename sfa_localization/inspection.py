@@ -28,7 +28,7 @@ from sfa_localization.camera import body, kinds
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import VisualGyro
-from sfa_localization.camera.watch import FrozenWatch
+from sfa_localization.camera.watch import FrozenWatch, frozen
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array, wrap_angle
@@ -383,7 +383,10 @@ class _Survey:
         if self._rolls_and_pitches:
             tilt = np.degrees(np.std(self._rolls_and_pitches, 0).mean())
             report.tilt = f'tilts the robot by {tilt:.1f} degrees'
-        turns = (stamps, yaw) if camera is not None and camera.shows_turns else None
+        text = frozen(self._repeats, len(stamps))
+        report.lacks += [text] if text else []
+        shows_turns = camera is not None and camera.shows_turns and not text
+        turns = (stamps, yaw) if shows_turns else None
         rates = self._values.get(self._imu, [])
         gyro = to_yaw_rate(sorted(rates)) if rates else None
         is_panorama = camera is not None and camera.is_panorama

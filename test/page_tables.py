@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of test/README.md that programs write: `<!-- NAME -->`, the table, `<!-- end -->`."""
+"""Tables of the pages that programs write: `<!-- NAME -->`, the table, `<!-- end -->`."""
 
 import re
 from pathlib import Path
@@ -10,14 +10,16 @@ PAGE = Path(__file__).with_name('README.md')
 
 def markdown(header, rows):
     """Return a table; columns whose name ends with a colon are right aligned."""
-    ruler = ['---:' if name.endswith(':') else '---' for name in header]
-    lines = [name.rstrip(':') for name in header], ruler, *rows
-    return ''.join(f'| {" | ".join(line)} |\n' for line in lines)
+    ruler = ''.join('|---:' if name.endswith(':') else '|---' for name in header)
+    head, *lines = (
+        f'| {" | ".join(line)} |\n' for line in ([n.rstrip(':') for n in header], *rows)
+    )
+    return f'{head}{ruler}|\n{"".join(lines)}'
 
 
-def write_table(name, table):
+def write_table(name, table, page=PAGE):
     """Replace the table of this name on the page."""
     mark = re.compile(rf'(<!-- {name} -->\n).*?(<!-- end -->\n)', re.DOTALL)
-    text, count = mark.subn(lambda match: match[1] + table + match[2], PAGE.read_text('utf-8'))
-    assert count == 1, f'{PAGE}: lacks <!-- {name} --> and <!-- end -->'
-    PAGE.write_text(text, 'utf-8')
+    text, count = mark.subn(lambda match: match[1] + table + match[2], page.read_text('utf-8'))
+    assert count == 1, f'{page}: lacks <!-- {name} --> and <!-- end -->'
+    page.write_text(text, 'utf-8')

@@ -17,6 +17,7 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.data.errors import BagError
+from sfa_localization.inspection import inspect
 
 ZSTD = b'\x28\xb5\x2f\xfd'
 
@@ -243,6 +244,17 @@ def test_learning_leaves_out_images_that_repeat_the_one_before(distinct, used, t
     assert run.panoramas.shape == (60, 600, 3)
     skipped = {'image repeats the one before': 3} if distinct else {}
     assert run.counts['images'].as_dict() == {'used': len(used), 'skipped': skipped}
+
+
+def test_a_drive_of_a_frozen_camera_is_refused_by_its_cause(tmp_path):
+    """Also by inspect, which then does not blame the turns of the images."""
+    formats.write_pictures(tmp_path / 'bag', [image(0)] * 40)
+    text = '39 of 40 images repeat the one before: the camera was frozen'
+    with pytest.raises(BagError, match=f'bag: /image: {text}'):
+        read_drive(tmp_path / 'bag', tmp_path / 'cache', ReadingRecipe(distinct=True))
+    report = inspect(tmp_path / 'bag')
+    assert any(lack.startswith(text) for lack in report.lacks)
+    assert not any('images turn' in lack for lack in report.lacks)
 
 
 def test_truth_is_read_only_when_wanted(tmp_path, messages):

@@ -22,9 +22,10 @@ import pytest
 import yaml
 from picture_readers import PictureReader
 from robustness import promises
+from study import page as results_page
 from study.__main__ import study_parser
 
-from sfa_localization import cli
+from sfa_localization import __version__, cli
 from sfa_localization.bags.reader import Bag
 from sfa_localization.data.settings import Settings
 from sfa_localization.nodes.entry import CANNOT_START, DIED
@@ -37,6 +38,7 @@ PAGES = {
     for pattern in ('*.md', 'config/*.md', 'bags/*.md', 'test/*.md')
     for path in ROOT.glob(pattern)
 }
+EVALUATION = 'test/EVALUATION.md'
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 BLOCK = re.compile(r'```(?:bash|sh)\n(.*?)```', re.DOTALL)
 INLINE = re.compile(r'`((?:sfa_localization|make) [^`]+)`')
@@ -118,6 +120,26 @@ def parameters() -> set[str]:
 def topics() -> set[str]:
     """Return the topics in the table of config/README.md, which those of the nodes are."""
     return {topic for topic, *_ in TOPIC_ROW.findall(PAGES['config/README.md'])}
+
+
+def test_pages_are_of_the_version_and_date_of_the_recorded_results():
+    """And test/EVALUATION.md shows these results: make study ARGS='page FOLDER'."""
+    record, evaluation = json.loads(results_page.RECORD.read_text('utf-8')), PAGES[EVALUATION]
+    assert record['version'] == __version__
+    for name in ('README.md', 'test/README.md', EVALUATION):
+        assert f'<!-- version -->\n{results_page.dated(record)}<!-- end -->' in PAGES[name], name
+    assert re.findall(r'20\d\d-\d\d-\d\d', evaluation) == [record['date']]
+    assert not re.search(r'(January|June|November|December) 20\d\d', evaluation)
+    for name, table in results_page.tables(record['results']).items():
+        text = table or results_page.UNMEASURED
+        assert f'<!-- {name} -->\n{text}<!-- end -->' in evaluation, name
+
+
+def test_the_evaluation_is_short():
+    """Eight columns and 2,300 words at most, marks of tables included, as `wc -w` counts."""
+    rulers = re.findall(r'^\|(?:[ :-]+\|)+$', PAGES[EVALUATION], re.MULTILINE)
+    assert max(ruler.count('|') - 1 for ruler in rulers) <= 8
+    assert len(PAGES[EVALUATION].split()) <= 2300
 
 
 def test_links_and_topics_exist():

@@ -25,7 +25,7 @@ from sfa_localization.bags.topic_stream import Stream, clock_offset
 from sfa_localization.camera.leveling import LeveledPanoramas, tilts_at
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
-from sfa_localization.camera.watch import FrozenWatch
+from sfa_localization.camera.watch import FrozenWatch, frozen
 from sfa_localization.data.errors import BagError, DataError, MessageError, ModelError
 from sfa_localization.data.files import replaced_mode
 from sfa_localization.data.messages import read_tilt, read_yaw_rate
@@ -205,6 +205,7 @@ class _PanoramaFile:
             self._unwrap = Unwrapper(masked, recipe.panorama)
         self._watch = FrozenWatch() if recipe.distinct else None
         self.stamps: list[int] = []
+        self.repeats = 0
         self._shape: tuple[int, ...] = ()
 
     def panorama(self, image: Image) -> Image:
@@ -217,6 +218,7 @@ class _PanoramaFile:
                 raise MessageError(f'size is not {width}x{height} like the first image')
         image = self._unwrap(image)
         if self._watch is not None and not self._watch.add(image):
+            self.repeats += 1
             raise MessageError('image repeats the one before')
         self._shape = self._shape or image.shape
         return image
@@ -262,7 +264,9 @@ def _other_streams(bag: Bag, recipe: ReadingRecipe, want_truth: bool) -> dict[st
 def _read(
     bag: Bag, streams: dict[str, Stream], stored: _PanoramaFile, progress: bool
 ) -> dict[str, StampedValues]:
-    """Store the images; return the values of the other streams by their use."""
+    """Store the images; return the values of the other streams by their use. Raises BagError for
+    the images of a frozen camera.
+    """
     uses = {id(stream): use for use, stream in streams.items()}
     values: dict[str, StampedValues] = {use: [] for use in streams}
     total = bag.topics[streams['images'].topic].count
@@ -273,6 +277,8 @@ def _read(
                 bar.update(stream.received - bar.n)
             else:
                 values[uses[id(stream)]].append((stamp_ns, value))
+    if text := frozen(stored.repeats, stored.repeats + len(stored.stamps)):
+        raise BagError(f'{bag.path}: {streams["images"].topic}: {text}')
     return values
 
 

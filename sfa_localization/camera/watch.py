@@ -27,6 +27,16 @@ EXPLAINED_WARNING = 0.4
 _STRIDE = 3  # every third pixel along each axis is compared
 
 
+def frozen(repeats: int, count: int) -> str:
+    """A sentence if so many of the images repeat the one before that the camera was frozen."""
+    if repeats < (1 - 1 / FROZEN_IMAGES) * count or not repeats:
+        return ''
+    return (
+        f'{repeats} of {count} images repeat the one before: the camera was frozen; restart its '
+        'driver, and record again'
+    )
+
+
 class FrozenWatch:
     """How often, and for how long, a camera has repeated its last image."""
 

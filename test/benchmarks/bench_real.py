@@ -12,16 +12,15 @@ from __future__ import annotations
 import argparse
 import gzip
 import json
-import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from scipy.stats import chi2
 
-from sfa_localization import filtering
+from sfa_localization import __version__, filtering
 from sfa_localization.data.events import IMAGE, merge_by_stamp
+from sfa_localization.data.files import write_json
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion.settings import FilterConfig
@@ -121,15 +120,17 @@ def _plain(path: Path, folder: Path) -> Path:
     return folder / path.name
 
 
-def main() -> Iterator[str]:
-    """A line for each log, and their mean."""
+def main() -> None:
+    """Print a line for each log; write real.json for `study page`."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('logs', nargs='+', metavar='LOG')
-    for log in parser.parse_args().logs:
-        yield json.dumps({'log': Path(log).name, **compare(log)})
+    parser.add_argument('--out', type=Path, default=Path('study_real'), metavar='DIR')
+    arguments, cells = parser.parse_args(), []
+    for log in arguments.logs:
+        cells.append({'log': Path(log).name, **compare(log)})
+        print(json.dumps(cells[-1]), flush=True)
+    write_json(arguments.out / 'real.json', {'settings': {'version': __version__}, 'cells': cells})
 
 
 if __name__ == '__main__':
-    for line in main():
-        sys.stdout.write(line + '\n')
-        sys.stdout.flush()
+    main()

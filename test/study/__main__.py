@@ -6,6 +6,7 @@ PYTHONPATH=.:test python -m study all --quick
 PYTHONPATH=.:test python -m study simulator --seeds 5
 PYTHONPATH=.:test python -m study baselines --training bags/coverage bags/lines --test bags/test
 PYTHONPATH=.:test python -m study half_real bags/real --poses truth.tum --odometry odom.csv
+PYTHONPATH=.:test python -m study page study_paper study_light
 """
 
 from __future__ import annotations
@@ -18,21 +19,24 @@ from pathlib import Path
 from sfa_localization.cli import guarded
 from sfa_localization.commands.options import add_settings, settings
 from sfa_localization.data.errors import ConfigError
-from study import half_real, large, light, light_report, year, year_report
+from study import bags, half_real, large, light, light_report, page, rig, year, year_report
 from study.results import Progress, StudyConfig
 from study.sites import FULL, QUICK
 from study.tables import NAMES, Work
 
 STUDIES = {
-    'all': 'the next five, which take hours',
+    'all': 'the next eight, which take hours, and their page',
     'simulator': "the paper's experiment in its simulator",
     'robot': "the paper's experiment with a robot, simulated",
     'baselines': 'other features instead of slow features',
     'ablations': 'this package without some of its parts',
-    'light': 'train in one, two or three lights, test in every light and season',
+    'light': 'train by day in summer, test in every light and season',
+    'rig': 'a camera ahead of the axle, and uneven ground',
     'year': 'train once, then drive each month, with and without updates of the model',
     'large': 'gardens of 16 m x 18 m to 64 m x 72 m, at one density of drives',
 }
+COMMANDS = {'half_real': half_real, 'bags': bags, 'page': page}
+"""What needs other arguments."""
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -49,7 +53,8 @@ def study_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar='STUDY', required=True)
     for name, summary in STUDIES.items():
         add_arguments(commands.add_parser(name, help=summary), name)
-    half_real.add_arguments(commands.add_parser('half_real', help=half_real.SUMMARY))
+    for name, command in COMMANDS.items():
+        command.add_arguments(commands.add_parser(name, help=command.SUMMARY))
     return parser
 
 
@@ -61,10 +66,10 @@ def add_arguments(parser: argparse.ArgumentParser, name: str) -> None:
         type=Path,
         metavar='DIR',
         help='folder to write, or one with the same settings to go on with [study_paper, '
-        'study_light, study_year, study_large; with --quick study_quick...]',
+        'study_light, study_rig, study_year, study_large; with --quick study_quick_paper...]',
     )
     parser.add_argument(
-        '--quick', action='store_true', help='a smaller garden, smaller images, fewer seasons'
+        '--quick', action='store_true', help='a smaller garden, smaller images, fewer months'
     )
     add_settings(parser, StudyConfig)
     if name == 'baselines':
@@ -75,42 +80,54 @@ def add_arguments(parser: argparse.ArgumentParser, name: str) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Complete the studies, and print their tables."""
-    config = settings(StudyConfig, arguments)
-    start = 'study_quick_' if arguments.quick else 'study_'
+    """Complete the studies, and print their tables; of all, write the page."""
     if bool(arguments.training) != bool(arguments.test):
         raise ConfigError('--training and --test: give both, or neither')
-    chosen = (*NAMES, 'light') if arguments.study == 'all' else (arguments.study,)
+    every = arguments.study == 'all'
+    chosen = [*STUDIES][1:] if every else [arguments.study]
+    folders = {name: _folder(arguments, name) for name in chosen}
     paper = [name for name in chosen if name in NAMES]
     if paper:
-        _paper(paper, arguments.out or Path(f'{start}paper'), config, arguments)
-    if 'light' in chosen:
-        out = arguments.out and (arguments.out / 'light' if paper else arguments.out)
-        plan = light.QUICK if arguments.quick else light.FULL
-        cells = light.fill_matrix(out or Path(f'{start}light'), config, plan, progress=True)
-        print(light_report.table(cells))
-    if 'year' in chosen:
-        months = year.QUICK_YEAR if arguments.quick else year.YEAR
-        cells = year.judge_year(
-            arguments.out or Path(f'{start}year'), config, months, progress=True
-        )
-        print(year_report.table(cells))
-    if 'large' in chosen:
-        areas = large.QUICK_AREAS if arguments.quick else large.AREAS
-        print(large.judge_areas(arguments.out or Path(f'{start}large'), config, areas))
+        _paper(paper, folders[paper[0]], arguments)
+    for name in chosen:
+        if name not in NAMES:
+            print(_other(name, folders[name], arguments), end='')
+    if every and not arguments.quick:
+        page.update([*dict.fromkeys(folders.values())])
     return 0
 
 
-def _paper(
-    names: Sequence[str], out: Path, config: StudyConfig, arguments: argparse.Namespace
-) -> None:
+def _folder(arguments: argparse.Namespace, name: str) -> Path:
+    """The folder of a study; the paper's results share one."""
+    name = 'paper' if name in NAMES else name
+    if arguments.out is None:
+        return Path(f'study_quick_{name}' if arguments.quick else f'study_{name}')
+    return Path(arguments.out / name if arguments.study == 'all' else arguments.out)
+
+
+def _paper(names: Sequence[str], out: Path, arguments: argparse.Namespace) -> None:
     """Announce the duration of the paper's results, then complete them in one folder."""
     plan, training = QUICK if arguments.quick else FULL, tuple(arguments.training)
+    config = settings(StudyConfig, arguments)
     work = Work(out, config, plan, Progress(shown=True), training, arguments.test)
-    lights = light.QUICK if arguments.quick else light.FULL
-    work.announce(names, lights.minutes if arguments.study == 'all' else 0)
+    work.announce(names)
     for name in names:
-        print(work.reproduced(name))
+        print(work.reproduced(name), end='')
+
+
+def _other(name: str, out: Path, arguments: argparse.Namespace) -> str:
+    """Complete another study; return its table."""
+    config, quick, progress = settings(StudyConfig, arguments), arguments.quick, Progress(True)
+    if name == 'light':
+        return light_report.table(light.fill_matrix(out, config, progress))
+    if name == 'rig':
+        cases = rig.QUICK_CASES if quick else rig.CASES
+        return rig.table(rig.judge_rigs(out, config, cases, progress))
+    if name == 'year':
+        months = year.QUICK_MONTHS if quick else year.MONTHS
+        return year_report.table(year.judge_year(out, config, months, progress))
+    areas = large.QUICK_AREAS if quick else large.AREAS
+    return large.table(large.judge_areas(out, config, areas))
 
 
 if __name__ == '__main__':

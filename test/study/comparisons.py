@@ -8,61 +8,46 @@ leave out a part of this package, and are evaluated as the nodes would work.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from unittest.mock import patch
 
 import numpy as np
 
 from sfa_localization.data.errors import LocalizationError
+from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Odometry, Run, differences
 from sfa_localization.evaluation import evaluate
 from sfa_localization.keyframes.light import Conditions
 from sfa_localization.keyframes.location import Location
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE
+from sfa_localization.keyframes.regression import Fit
 from sfa_localization.metric.learning import MetricResult, learn_metric
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.observer import UNKNOWN_VARIANCE
 from sfa_localization.place_model import PlaceModel, View
-from sfa_localization.sfa.network import (
-    PAPER_LAYERS,
-    Architecture,
-    Layer,
-    standard_architecture,
-)
-from sfa_localization.sfa.network_training import LIGHT_STD, ImageSequence, train_network
+from sfa_localization.sfa.network import standard_architecture
+from sfa_localization.sfa.network_training import ImageSequence, train_network
 from sfa_localization.sfa.settings import NetworkConfig
-from sfa_localization.training import Recipe
-from study.results import BATCH, Cell, Results
-from study.retrieval import ImageRetrieval
-from study.signatures import FourierSignature, TurnedComponents
+from study.results import Cell, Results
+from study.signatures import FourierSignature
 from study.sites import Site, learned
-from study.trials import MONOMIALS, STRAIGHT, Features, Study, Trial, mean_error, slow_of, turned_of
+from study.trials import Features, Study, Trial, scores_of, slow_of, turned_of
 
 BASELINES: dict[str, Callable[[Study, PlaceModel], Features]] = {
-    'principal components of all rotations': (
-        lambda study, _model: TurnedComponents.fit(study.batches).features
-    ),
     'Fourier signatures of rows': lambda study, _model: (
         FourierSignature.fit(study.batches).features
     ),
     'slow features, first pass': lambda _study, model: slow_of(model.network),
 }
 """Features that metric learning is given, of the images alone."""
-SECOND, WHOLE, RETRIEVAL = (
-    'turned maps, second pass', 'this package, one image', 'nearest image, at true positions',
-)  # fmt: skip
-MEASURES = {
-    'test': 'test (m)',
-    'test_supervised': 'test, supervised (m)',
-    'training': 'training (m)',
-    'training_supervised': 'training, supervised (m)',
-}
+SECOND, WHOLE = 'turned maps, second pass', 'this package, one image'
+FEATURES = (*BASELINES, SECOND, WHOLE)
 
 
 def baselines(site: Site, results: Results, world: str) -> None:
-    """Add the cells of a world: errors in m, as `MEASURES` names them, by `features`."""
-    names = (*BASELINES, SECOND, WHOLE, RETRIEVAL)
-    missing = [n for n in names if results.find(world=world, features=n) is None]
+    """Add the cells of a world: errors in m, as `Trial.errors` names them, by `features`."""
+    missing = [n for n in FEATURES if results.find(world=world, features=n) is None]
     if not missing:
         return
     study = site.study()
@@ -75,8 +60,6 @@ def baselines(site: Site, results: Results, world: str) -> None:
 def _judged(site: Site, study: Study, model: PlaceModel, name: str) -> Cell:
     """Errors of a kind of features, or the `problem` if they give no map."""
     rows = study.laid_on(SegmentConfig())
-    if name == RETRIEVAL:
-        return _retrieved(study)
     if name == WHOLE:
         judged = evaluate(model, site.test, align_bags=site.training, recipe=site.recipe)
         return {'test': judged.scores['sfa']['mean'], 'ekf': judged.scores['ekf']['mean']}
@@ -93,21 +76,8 @@ def _judged(site: Site, study: Study, model: PlaceModel, name: str) -> Cell:
     return Trial.of(study, metric, features, rows, fitted).errors()
 
 
-def _retrieved(study: Study) -> Cell:
-    """Errors of the true position of the most similar training image."""
-    poses = np.column_stack([study.places, np.zeros(len(study.places))])
-    retrieval = ImageRetrieval.of((image for batch in study.batches() for image in batch), poses)
-    images = (i for batch in study.test.panoramas.batches(BATCH) for i in batch)
-    places = np.array([retrieval.locate(image)[:2] for image in images])
-    return {'test_supervised': mean_error(places, study.test_truth.poses[:, :2])}
-
-
 class SlowFeaturesAlone(PlaceModel):
     """A model with positions from slow features, turned by the headings of the keyframes."""
-
-    @classmethod
-    def of(cls, model: PlaceModel) -> SlowFeaturesAlone:
-        return cls(**{part.name: getattr(model, part.name) for part in fields(model)})
 
     def located(self, view: View, conditions: Conditions) -> Location:
         location = PlaceModel.located(self, view, conditions)
@@ -118,91 +88,42 @@ class SlowFeaturesAlone(PlaceModel):
         return replace(location, pose=np.append(places[0], 0.0), covariance=covariance)
 
 
+class KeyframesAlone(PlaceModel):
+    """A model whose slow features say nothing of the place: the likelihood of the image alone."""
+
+    def _slow_places(self, view: View, fits: Sequence[Fit]) -> tuple[Array, Array]:
+        places, variances = PlaceModel._slow_places(self, view, fits)
+        return places, np.full_like(variances, UNKNOWN_VARIANCE)
+
+
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """This package with a change. Empty `layers` mean the standard network."""
+    """This package with a change; `images` are located by a class of models."""
 
-    metric: MetricConfig = field(default_factory=MetricConfig)
-    segments: SegmentConfig = field(default_factory=SegmentConfig)
-    normalization: str = NetworkConfig().normalization
-    layers: tuple[Layer, ...] = ()
-    rotate: bool = True
-    light_std: float = LIGHT_STD
+    images: type[PlaceModel] = PlaceModel
     second_pass: bool = True
-    keyframes: bool = True
-    single_drive: bool = False
-    """The map is learned from the last training drive: the paper's descent starts from odometry,
-    whose frame is another one in each drive."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    rotate: bool = True
     exact_odometry: bool = False
     """In the training, not in the test: what the errors of odometry cost the map."""
 
-    @property
-    def same_network(self) -> bool:
-        """Whether it uses the network of the whole package."""
-        mine = self.normalization, self.layers, self.rotate, self.light_std
-        return mine == (NetworkConfig().normalization, (), True, LIGHT_STD)
 
-    @property
-    def same_map(self) -> bool:
-        """Whether it learns the map of the whole package, from its network."""
-        mine = self.metric, self.segments, self.second_pass, self.single_drive, self.exact_odometry
-        return mine == (MetricConfig(), SegmentConfig(), True, False, False)
-
-    def recipe(self, base: Recipe) -> Recipe:
-        """The recipe of the training."""
-        network = replace(base.network, normalization=self.normalization)
-        return replace(base, network=network, metric=self.metric, segments=self.segments)
-
-    def drives(self, study: Study) -> tuple[Run, ...]:
-        """The drives from which the map is learned."""
-        runs = study.training[-1:] if self.single_drive else study.training
-        return tuple(map(_exact, runs)) if self.exact_odometry else runs
-
-    def reduced(self, model: PlaceModel) -> PlaceModel:
-        """A model without the parts that it does without."""
-        return model if self.keyframes else SlowFeaturesAlone.of(model)
-
-    def architecture(self, size: tuple[int, int]) -> Architecture:
-        """Its network for panoramas of (rows, columns)."""
-        standard = standard_architecture(size, self.normalization)
-        return replace(standard, layers=self.layers) if self.layers else standard
-
-
-FIRST, SECOND_LAYER, TOP = PAPER_LAYERS
-TWO_LAYERS = (FIRST, replace(TOP, field=(6, 20)))
-FOUR_LAYERS = (FIRST, SECOND_LAYER, Layer((2, 5), (1, 1), 32, 32), replace(TOP, field=(3, 20)))
 VARIANTS = {
-    'everything': Variant(),
-    'no keyframes': Variant(keyframes=False),
+    'everything: likelihood and slow features': Variant(),
+    'one image by its likelihood alone': Variant(images=KeyframesAlone),
+    'one image by slow features alone': Variant(images=SlowFeaturesAlone),
     'no second pass': Variant(second_pass=False),
-    'neither: slow features alone': Variant(second_pass=False, keyframes=False),
-    'straight segments only': Variant(segments=STRAIGHT),
-    'monomials, 8 features; no second pass': Variant(metric=MONOMIALS),
-    'the same, straight lines of one drive': Variant(
-        metric=MONOMIALS, segments=STRAIGHT, single_drive=True
-    ),
-    "the same, paper's solver": Variant(
-        metric=replace(MONOMIALS, solver='paper'), segments=STRAIGHT, single_drive=True
-    ),
     'exact odometry in the training': Variant(exact_odometry=True),
     'no simulated rotation': Variant(rotate=False),
-    'no random light': Variant(light_std=0.0),
-    'two layers; no second pass': Variant(layers=TWO_LAYERS),
-    'four layers': Variant(layers=FOUR_LAYERS),
-    'gray': Variant(normalization='grey'),
-    'color as it is': Variant(normalization='none'),
+    'gray': Variant(network=NetworkConfig(normalization='grey')),
 }
 """The rows of the table of ablations."""
-SCORES = {
-    'slow': 'slow features alone (m)',
-    'sfa': 'one image (m)',
-    'ekf': 'EKF (m)',
-    'heading': 'EKF heading (°)',
-}
 
 
 def ablations(site: Site, results: Results, world: str) -> None:
-    """Add the cells of a world: errors in m and degrees, as `SCORES` names them, by `variant`."""
+    """Add the cells of a world by `variant`: `heading`, the mean error of the filter in degrees,
+    and what `scores_of` names.
+    """
     missing = [n for n in VARIANTS if results.find(world=world, variant=n) is None]
     if not missing:
         return
@@ -234,32 +155,22 @@ def _first_pass(
 
 
 def _ablated(site: Site, study: Study, whole: PlaceModel, variant: Variant) -> Cell:
-    """Scores of a variant, aligned on the last training drive."""
-    recipe, network = variant.recipe(site.recipe), whole.network
-    if not variant.same_network:
-        drive = study.training[0]
-        network = train_network(
-            variant.architecture(drive.panoramas.shape[:2]),
-            [ImageSequence.of(drive)],
-            recipe.network.seed,
-            light_std=variant.light_std,
-            rotate=variant.rotate,
-        )
-    same, drives = variant.same_network and variant.same_map, variant.drives(study)
-    with patch('sfa_localization.training.with_turned', _first_pass):
-        first = learned(network, drives, recipe)
-    if variant.second_pass:
-        model = whole if same else learned(network, drives, recipe)
-    else:
-        model = first
-    model = variant.reduced(model)
+    """Scores of a variant, aligned on the training drives."""
+    network, runs, model = whole.network, study.training, whole
+    recipe = replace(site.recipe, network=variant.network)
+    if (variant.network, variant.rotate) != (NetworkConfig(), True):
+        size, normalization = runs[0].panoramas.shape[:2], variant.network.normalization
+        architecture = standard_architecture(size, normalization)
+        images, seed = [ImageSequence.of(runs[0])], variant.network.seed
+        network = train_network(architecture, images, seed, rotate=variant.rotate)
+    if variant.exact_odometry:
+        runs = tuple(map(_exact, runs))
+    if not variant.second_pass:
+        with patch('sfa_localization.training.with_turned', _first_pass):
+            model = learned(network, runs, recipe)
+    elif network is not whole.network or variant.exact_odometry:
+        model = learned(network, runs, recipe)
+    model = variant.images(**{part.name: getattr(model, part.name) for part in fields(model)})
     judged = evaluate(model, site.test, align_bags=site.training, recipe=site.recipe)
-    alone = Variant(keyframes=False).reduced(first)
-    slow = evaluate(alone, site.test, align_bags=site.training, recipe=site.recipe)
     heading = judged.scores['ekf']['yaw_deg']
-    return {
-        'slow': slow.scores['sfa']['mean'],
-        'sfa': judged.scores['sfa']['mean'],
-        'ekf': judged.scores['ekf']['mean'],
-        'heading': heading['mean'] if heading else None,
-    }
+    return {'heading': heading['mean'] if heading else None, **scores_of(judged)}

@@ -17,6 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from page_tables import markdown
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.reports.evaluation import MARGIN_M, TRUTH
@@ -47,8 +48,6 @@ ROWS = {
     'test_supervised': 'test, supervised',
     'test': 'test, unsupervised map',
     'image': 'test, one image with keyframes',
-    'scaled': 'same, scale and frame fitted on the test',
-    'odometry': 'test, odometry',
     'ekf': 'test, EKF',
     'gain': 'EKF against odometry',
 }
@@ -58,23 +57,27 @@ _UNKNOWN = '-'
 def paper_table(name: str, cells: Cells) -> str:
     """The errors of an experiment as a Markdown table: the paper's, and those of each column."""
     columns = [c for c in COLUMNS if any(c in cell['columns'] for cell in cells)]
-    head = ['mean error (m)', 'paper', *(COLUMNS[c] for c in columns)]
-    lines = [head, ['---', *['---:'] * (len(head) - 1)]]
+    head = [
+        f'mean error (m), {gardens(len(cells))}',
+        'paper:',
+        *(f'{COLUMNS[c]}:' for c in columns),
+    ]
+    rows = []
     for row, label in ROWS.items():
-        values = [_of_paper(name, row), *(_text(row, _values(cells, c, row)) for c in columns)]
+        values = [_of_paper(name, row), *(_text(row, values_of(cells, c, row)) for c in columns)]
         if any(value != _UNKNOWN for value in values):
-            lines.append([label, *values])
-    return markdown(lines)
+            rows.append([label, *values])
+    return markdown(head, rows)
 
 
 def _of_paper(name: str, row: str) -> str:
     numbers = PAPER[name]
     if row == 'gain' and 'odometry' in numbers:
-        return f'{100 * (numbers["ekf"] / numbers["odometry"] - 1):.0f} %'
+        return f'{100 * (numbers["ekf"] / numbers["odometry"] - 1):.0f}%'
     return f'{numbers[row]:.2f}' if row in numbers else _UNKNOWN
 
 
-def _values(cells: Cells, column: str, row: str) -> list[float]:
+def values_of(cells: Cells, column: str, row: str) -> list[float]:
     """One number for each seed that has it."""
     values = []
     for cell in cells:
@@ -90,28 +93,43 @@ def _values(cells: Cells, column: str, row: str) -> list[float]:
 def _text(row: str, values: Sequence[float]) -> str:
     if not values:
         return _UNKNOWN
-    digits, unit = (0, ' %') if row == 'gain' else (3, '')
-    spread = f' ± {np.std(values, ddof=1):.{digits}f}' if len(values) > 1 else ''
+    digits, unit = (0, '%') if row == 'gain' else (3, '')
+    spread = f'±{np.std(values, ddof=1):.{digits}f}' if len(values) > 1 else ''
     return f'{np.mean(values):.{digits}f}{spread}{unit}'
 
 
-def comparison_table(cells: Cells, label: str, measures: Mapping[str, str]) -> str:
-    """A line for each `label`, a column for each measure of each world, as Markdown."""
+def baselines_table(cells: Cells) -> str:
+    """A line for each kind of features, a column for each world: test/supervised (m)."""
     worlds = list(dict.fromkeys(str(cell['world']) for cell in cells))
-    names = list(dict.fromkeys(str(cell[label]) for cell in cells))
-    columns = [(w, text) for w in worlds for text in measures.values()]
-    titles = [f'{text}, {w}' if len(worlds) > 1 else text for w, text in columns]
-    lines = [[label, *titles], ['---', *['---:'] * len(titles)]]
-    by_name = {(str(cell['world']), str(cell[label])): cell for cell in cells}
-    for name in names:
-        values = [by_name.get((w, name), {}).get(m) for w in worlds for m in measures]
-        lines.append([name, *(_UNKNOWN if v is None else f'{v:.3f}' for v in values)])
-    return markdown(lines)
+    rows = []
+    for name in dict.fromkeys(str(cell['features']) for cell in cells):
+        same = {str(cell['world']): cell for cell in cells if cell['features'] == name}
+        pairs = [[same.get(w, {}).get(m) for m in ('test', 'test_supervised')] for w in worlds]
+        rows.append([name, *('/'.join(map(number, pair)) for pair in pairs)])
+    return markdown(['features, test/supervised (m)', *(f'{w}:' for w in worlds)], rows)
 
 
-def markdown(lines: Sequence[Sequence[str]]) -> str:
-    """Rows of cells as a Markdown table."""
-    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+def ablations_table(cells: Cells) -> str:
+    """A line for each variant."""
+    forms = {
+        'sfa': '{:.3f}', 'sfa_nees': '{:.2f}', 'ekf': '{:.3f}', 'ekf_nees': '{:.2f}',
+        'heading': '{:.2f}',
+    }  # fmt: skip
+    rows = [
+        [c['variant'], *(number(c.get(name), form) for name, form in forms.items())] for c in cells
+    ]
+    head = ['variant', 'one image (m):', 'ratio:', 'EKF (m):', 'ratio:', 'EKF heading (°):']
+    return markdown(head, rows)
+
+
+def gardens(count: int) -> str:
+    """A number of gardens in words."""
+    return f'{count} gardens' if count > 1 else 'one garden'
+
+
+def number(value: float | None, form: str = '{:.3f}') -> str:
+    """A number as text, '-' where there is none."""
+    return _UNKNOWN if value is None else form.format(value)
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,7 +37,7 @@ class StudyConfig(Settings):
     world: int = setting(1, 'garden, the first of --seeds', low=0, high=2**63 - 1)
     seed: int = setting(1, 'drives and sensor errors; of each drive another', low=0, high=2**62)
     seeds: int = setting(
-        1, 'gardens, each with drives of its own; ablations and light use the first',
+        1, 'gardens of simulator, robot and rig, each with drives of its own',
         low=1, high=1000,
     )  # fmt: skip
 

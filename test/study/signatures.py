@@ -3,8 +3,7 @@
 """Features of panoramas that do not depend on the heading, without slowness: for comparison.
 
 Turning the robot turns the phases of the harmonics of every row of the panorama, and leaves their
-magnitudes. The Fourier signature keeps the magnitudes of all rows; principal components of all
-rotated views of the images are components of each harmonic, of which the magnitudes are kept.
+magnitudes. The Fourier signature keeps the magnitudes of all rows.
 """
 
 from __future__ import annotations
@@ -75,37 +74,6 @@ class FourierSignature:
 
 def _magnitudes(images: Image) -> Array:
     return np.array([np.abs(row_harmonics(image)).ravel() for image in images])
-
-
-@dataclass(frozen=True, slots=True)
-class TurnedComponents:
-    """Principal components of all rotations of the images; features are their magnitudes.
-
-    The covariance over all rotations mixes no two harmonics, so component k is `axes[k]`
-    (rows * channels,) of harmonic `harmonic[k]`.
-    """
-
-    harmonic: NDArray[np.int64]
-    axes: Complex
-
-    @classmethod
-    def fit(cls, batches: Batches) -> TurnedComponents:
-        """Fit to panoramas in batches (T, h, w, C). Raises DataError for fewer than two."""
-        count, moments = 0, np.zeros((1, 1, 1), complex)
-        for images in batches():
-            waves = np.array([row_harmonics(image) for image in images])
-            count += len(waves)
-            moments = moments + np.einsum('thi,thj->hij', waves, waves.conj(), optimize=True)
-        _require(count)
-        variance, axes = np.linalg.eigh(moments)
-        order = np.argsort(variance, axis=None)[::-1][:DIMENSIONS]
-        harmonic, number = np.unravel_index(order, variance.shape)
-        return cls(harmonic.astype(np.int64), axes[harmonic, :, number])
-
-    def features(self, images: Image) -> Array:
-        """Features (T, K), the strongest first, of panoramas (T, h, w, C)."""
-        waves = np.array([row_harmonics(image)[self.harmonic] for image in images])
-        return np.asarray(np.abs(np.einsum('tki,ki->tk', waves, self.axes.conj())))
 
 
 def _require(count: int) -> None:

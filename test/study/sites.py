@@ -1,12 +1,13 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Gardens of the paper's sizes, with the drives and models that the paper's results share."""
+"""Gardens of the paper's sizes, whose drives and models its results share; and a small one."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from sfa_localization.bags.drives import as_live, image_folder
 from sfa_localization.camera.settings import PanoramaConfig
@@ -18,8 +19,15 @@ from sfa_localization.sfa.network_training import ImageSequence, train_network
 from sfa_localization.simulation.drive import drive
 from sfa_localization.simulation.garden import Garden
 from sfa_localization.simulation.settings import SimulationConfig
-from sfa_localization.training import Recipe, learn_place
-from study.results import Progress, recorded
+from sfa_localization.training import Recipe, learn_place, train
+from study.results import (
+    Progress,
+    Results,
+    StudyConfig,
+    recorded,
+    settings_of,
+    usual_drift,
+)
 from study.trials import Study
 
 
@@ -51,6 +59,8 @@ QUICK = SitePlan(
 ROUTES = {'simulator': ('coverage', 'lines'), 'robot': ('mower',)}
 """Training drives of the experiments: the network is trained on the first, and the map is aligned
 with the truth on the last."""
+SMALL_AREA, SMALL_PANORAMA = (8.0, 8.0), (300, 30)
+"""Sides, m, and columns and rows of panoramas, of the studies of light, rig and year."""
 # The count of images settles in three or four.
 _TRIES = 30
 
@@ -96,6 +106,42 @@ class Site:
             self.progress.say(f'train on {study.training[0].name}')
             network = network_of(study.training[:1], self.recipe)
             learned(network, study.training, self.recipe).save(path)
+        return PlaceModel.load(path)
+
+
+@dataclass(frozen=True, slots=True)
+class SmallGarden:
+    """A small garden, with bags and models in a folder."""
+
+    folder: Path
+    world: int
+    seed: int
+    progress: Progress
+
+    @staticmethod
+    def results(file: Path, config: StudyConfig) -> Results:
+        """The finished cells in a file. Raises LocalizationError for those of other settings."""
+        settings = settings_of(config.world, config.seed, SMALL_AREA, SMALL_PANORAMA)
+        return Results.opened(file, settings)
+
+    def config(self, number: int, **settings: Any) -> SimulationConfig:
+        """The settings of drive `number`, with those of its route and light."""
+        return SimulationConfig(
+            world=self.world, seed=self.seed + number, area=SMALL_AREA,
+            test_drift=usual_drift(SMALL_AREA), images='panorama', compression='jpeg', **settings,
+        )  # fmt: skip
+
+    def drive(self, name: str, number: int, **settings: Any) -> Path:
+        """The bag of a drive, simulated if it is missing."""
+        config = self.config(number, **settings)
+        return recorded(self.folder / name, config, SMALL_PANORAMA, self.progress)
+
+    def model(self, name: str, bag: Path, recipe: Recipe | None = None) -> PlaceModel:
+        """The model of a drive, trained if it is missing."""
+        path = self.folder / f'{name}.npz'
+        if not path.exists():
+            self.progress.say(f'train {path.name}')
+            train([bag], path, recipe, progress=self.progress.shown, resume=True)
         return PlaceModel.load(path)
 
 

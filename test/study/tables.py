@@ -11,13 +11,22 @@ from pathlib import Path
 
 from sfa_localization.reports.figures import save_text
 from sfa_localization.training import Recipe
-from study.comparisons import MEASURES, SCORES, VARIANTS, ablations, baselines
+from study.comparisons import FEATURES, VARIANTS, ablations, baselines
 from study.paper import experiment
-from study.paper_report import comparison_table, paper_table
+from study.paper_report import Cells, ablations_table, baselines_table, paper_table
 from study.results import Progress, Results, StudyConfig, settings_of
 from study.sites import ROUTES, Site, SitePlan
 
 NAMES = ('simulator', 'robot', 'baselines', 'ablations')
+
+
+def table(name: str, cells: Cells) -> str:
+    """The table of a result."""
+    if name in ROUTES:
+        return paper_table(name, cells)
+    if name == 'baselines':
+        return baselines_table([cell for cell in cells if cell['features'] in FEATURES])
+    return ablations_table([c for variant in VARIANTS for c in cells if c['variant'] == variant])
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +42,11 @@ class Work:
     bags: tuple[Path, ...] = ()
     test: Path | None = None
 
-    def announce(self, names: Sequence[str], minutes: int = 0) -> None:
-        """Announce the duration of these results, plus `minutes` of others."""
+    def announce(self, names: Sequence[str]) -> None:
+        """Announce the duration of these results."""
+        minutes = 0
         for name in names:
-            seeds = 1 if name == 'ablations' else self.config.seeds
+            seeds = self.config.seeds if name in ROUTES else 1
             minutes += seeds * self.plan.minutes[name]
         kept = 'what is finished is kept, and not made again'
         self.progress.say(f'this takes about {minutes} minutes on two cores; {kept}')
@@ -49,16 +59,12 @@ class Work:
         results = Results.opened(self.out / f'{name}.json', settings, files)
         if name in ROUTES:
             self._experiments(name, results)
-            text = paper_table(name, results.cells)
         elif name == 'baselines':
             self._baselines(results)
-            text = comparison_table(results.cells, 'features', MEASURES)
         else:
-            world = f'garden {config.world}'
-            ablations(self._site('simulator', 0), results, world)
-            cells = [c for name in VARIANTS for c in results.cells if c['variant'] == name]
-            text = comparison_table(cells, 'variant', SCORES)
-        save_text(self.out / f'{name}.md', text + '\n')
+            ablations(self._site('simulator', 0), results, f'garden {config.world}')
+        text = table(name, results.cells)
+        save_text(self.out / f'{name}.md', text)
         self.progress.say(f'see {self.out / f"{name}.md"}')
         return text
 
@@ -80,8 +86,6 @@ class Work:
             folder = self.out / f'bags_{zlib.crc32(" ".join(paths).encode()):08x}'
             folder.mkdir(exist_ok=True)
             site = Site(folder, self.bags, self.test, Recipe(), self.progress)
-            baselines(site, results, f'{" + ".join(paths[:-1])}, tested on {paths[-1]}')
+            baselines(site, results, f'bags of {self.test.resolve().parent.name}')
             return
-        for number in range(self.config.seeds):
-            site = self._site('simulator', number)
-            baselines(site, results, f'garden {self.config.world + number}')
+        baselines(self._site('simulator', 0), results, f'garden {self.config.world}')

@@ -21,7 +21,7 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform, align, compose, invert, rotation
 from sfa_localization.data.run import Image, Run, Trajectory
-from sfa_localization.evaluation import has_truth, score
+from sfa_localization.evaluation import Evaluation, has_truth, score
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
@@ -238,6 +238,19 @@ def true_start(run: Run, transform: RigidTransform) -> FilterConfig:
     """The filter's settings for a start at the true pose; `transform` leads from map to truth."""
     laid = np.array([transform.x_m, transform.y_m, transform.yaw_rad])
     return replace(TRUE_START, initial_pose=tuple(compose(invert(laid), start_of(run)).tolist()))
+
+
+def scores_of(judged: Evaluation) -> Cell:
+    """Of `sfa`, single images, and of the filter, `ekf`: the mean error (m); the share `_within` of
+    errors inside their 95 % ellipses; the mean squared error `_nees` over its expectation. And the
+    seconds `false_localised_s`.
+    """
+    cell: Cell = {'false_localised_s': judged.counts['false_localised_s']}
+    for name in ('sfa', 'ekf'):
+        scores = judged.scores[name]
+        cell[name] = scores['mean']
+        cell[f'{name}_within'], cell[f'{name}_nees'] = scores['within_95'], scores['nees']
+    return cell
 
 
 def mean_distance(path: Trajectory, truth: Trajectory) -> float:

@@ -3,24 +3,22 @@
 """The study `year`: one garden, learned once, and a drive in each month after that.
 
 Each drive is judged before anything learns from it. The first model stays frozen; a copy of it is
-updated after each drive; in some months another is trained anew, on the first drive and the last.
-Bags, models and cells that are finished are used again when the command is repeated.
+updated after each drive. Bags, models and cells that are finished are used again when the command
+is repeated.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import RigidTransform
-from sfa_localization.evaluation import evaluate
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.figures import save_text
-from sfa_localization.simulation.settings import SimulationConfig
-from sfa_localization.training import train
 from sfa_localization.updating import update
-from study.results import Cell, Progress, Results, StudyConfig, recorded, settings_of, usual_drift
+from study.light import judged
+from study.results import Cell, Progress, Results, StudyConfig
+from study.sites import SmallGarden
 from study.year_report import table
 
 RESULTS = 'year.json'
@@ -43,126 +41,53 @@ MONTHS = (
 """Months after the training, with the light and season of their drives."""
 
 
-@dataclass(frozen=True, slots=True)
-class YearPlan:
-    """Size of the garden (m) and of the panoramas, the months (1 to 12) before which a model is
-    trained anew, and about how many minutes it takes on two cores: measured for the quick one,
-    estimated by the number of pixels for the other.
-    """
-
-    area: tuple[float, float]
-    panorama: tuple[int, int]
-    retrained: tuple[int, ...]
-    minutes: int
-
-
-YEAR = YearPlan((16.0, 18.0), (600, 60), tuple(range(2, 13)), 240)
-QUICK_YEAR = YearPlan((8.0, 8.0), (300, 30), (6, 11), 10)
-
-
-@dataclass(frozen=True, slots=True)
-class _Work:
-    """The folder, the garden in it, and how its steps are shown."""
-
-    out: Path
-    config: StudyConfig
-    plan: YearPlan
-    progress: Progress
-
-    def drive(self, number: int) -> Path:
-        """The training drive, 0, or that of a month, each with a route of its own."""
-        bag = self.out / (f'month_{number:02d}' if number else 'first')
-        light, season = MONTHS[number - 1][1:] if number else FIRST
-        config = SimulationConfig(
-            trajectory='test' if number else 'coverage',
-            world=self.config.world,
-            seed=self.config.seed + number,
-            area=self.plan.area,
-            test_drift=usual_drift(self.plan.area),
-            light=light,
-            season=season,
-            images='panorama',
-            compression='jpeg',
-        )
-        return recorded(bag, config, self.plan.panorama, self.progress)
-
-    def trained(self, name: str, *drives: int) -> PlaceModel:
-        """The model trained on some drives."""
-        path = self.out / f'{name}.npz'
-        if not path.exists():
-            bags = [self.drive(number) for number in drives]
-            self.progress.say(f'train {path.name}')
-            train(bags, path, resume=True)
-        return PlaceModel.load(path)
-
-    def updated(self, model: PlaceModel, number: int) -> PlaceModel:
-        """The model, updated by the drive of a month unless the robot was never LOCALISED."""
-        path = self.out / f'updated_{number:02d}.npz'
-        if not path.exists():
-            try:
-                done = update(model, [self.drive(number)], path)
-                self.progress.say(done.sentence())
-            except DataError as error:
-                self.progress.say(str(error))
-                model.save(path)
-        return PlaceModel.load(path)
+QUICK_MONTHS = MONTHS[:3]
 
 
 def judge_year(
-    out: Path, config: StudyConfig, plan: YearPlan, *, progress: bool = False
+    out: Path, config: StudyConfig, months: Sequence[tuple[str, str, str]], progress: Progress
 ) -> list[Cell]:
-    """Judge all models in all months; write JSON and table below `out`. Returns the cells:
-    `model`, `month`, `light`, `season`, and the scores that `_judged` names.
+    """Judge both models in all months; write JSON and table below `out`. Returns the cells:
+    `model`, `month`, `light`, `season`, the mean errors `ekf_m` and `sfa_m`, and what
+    `light.judged` gives.
 
     Raises LocalizationError, also for a folder with anything else.
     """
-    report = Progress(progress)
-    settings = settings_of(config.world, config.seed, plan.area, plan.panorama)
-    results = Results.opened(out / RESULTS, settings)
-    report.say(f'this takes about {plan.minutes} minutes on two cores')
-    _fill(_Work(out, config, plan, report), results)
-    save_text(out / 'year.md', table(results.cells) + '\n')
-    report.say(f'see {out / "year.md"}')
+    results = SmallGarden.results(out / RESULTS, config)
+    progress.say('a month takes about 40 seconds on two cores')
+    _fill(SmallGarden(out, config.world, config.seed, progress), months, results)
+    save_text(out / 'year.md', table(results.cells))
+    progress.say(f'see {out / "year.md"}')
     return results.cells
 
 
-def _fill(work: _Work, results: Results) -> None:
+def _fill(garden: SmallGarden, months: Sequence[tuple[str, str, str]], results: Results) -> None:
     """Judge the missing models, month by month."""
-    frozen = updated = work.trained('frozen', 0)
+    light, season = FIRST
+    first = garden.drive('first', 0, trajectory='coverage', light=light, season=season)
+    frozen = updated = garden.model('frozen', first)
     transform = None
-    for number, (month, light, season) in enumerate(MONTHS, 1):
-        models = {'frozen': frozen, 'updated': updated}
-        if number in work.plan.retrained:
-            models['retrained'] = work.trained(f'retrained_{number:02d}', 0, number - 1)
-        for name, model in models.items():
+    for number, (month, light, season) in enumerate(months, 1):
+        name = f'month_{number:02d}'
+        drive = garden.drive(name, number, trajectory='test', light=light, season=season)
+        for name, model in {'frozen': frozen, 'updated': updated}.items():
             if results.find(model=name, month=month):
                 continue
-            work.progress.say(f'{month}, {light}, {season}: {name}')
-            # The map of a model that was trained anew lies elsewhere.
-            given = None if name == 'retrained' else transform
-            scores, fitted = _judged(model, work.drive(number), work.drive(0), given)
-            transform = transform if name == 'retrained' else fitted
+            garden.progress.say(f'{month}, {light}, {season}: {name}')
+            cell, transform = judged(model, drive, first, transform)
             names = {'model': name, 'month': month, 'light': light, 'season': season}
-            results.keep({**names, **scores})
-        updated = work.updated(updated, number)
+            errors = {f'{part}_m': cell[part]['mean_m'] for part in ('ekf', 'sfa') if part in cell}
+            results.keep({**names, **cell, **errors})
+        updated = _updated(garden, updated, drive, number)
 
 
-def _judged(
-    model: PlaceModel, bag: Path, align_bag: Path, transform: RigidTransform | None
-) -> tuple[Cell, RigidTransform | None]:
-    """Mean errors `ekf_m` and `sfa_m`, seconds `false_localised_s` and the share `localized` of a
-    drive, and the transform to the truth; only the `problem` of one without a usable image.
-    """
-    align = () if transform else (align_bag,)
-    try:
-        result = evaluate(model, bag, align_bags=align, transform=transform)
-    except DataError as error:
-        return {'problem': str(error)}, transform
-    states = result.counts['states_s']
-    scores = {
-        'ekf_m': result.scores['ekf']['mean'],
-        'sfa_m': result.scores['sfa']['mean'],
-        'false_localised_s': result.counts['false_localised_s'],
-        'localized': states.get('LOCALISED', 0.0) / max(sum(states.values()), 1e-9),
-    }
-    return scores, result.transform
+def _updated(garden: SmallGarden, model: PlaceModel, drive: Path, number: int) -> PlaceModel:
+    """The model, updated by the drive of a month unless the robot was never LOCALISED."""
+    path = garden.folder / f'updated_{number:02d}.npz'
+    if not path.exists():
+        try:
+            garden.progress.say(update(model, [drive], path).sentence())
+        except DataError as error:
+            garden.progress.say(str(error))
+            model.save(path)
+    return PlaceModel.load(path)
