@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -100,7 +101,7 @@ def _processes(workers: int) -> Iterator[Place]:
     context = multiprocessing.get_context('spawn')
 
     def submit(work: Callable[[Garden], str], garden: Garden) -> Future[str]:
-        executor = ProcessPoolExecutor(1, context, _leave_ctrl_c_to_the_parent)
+        executor = ProcessPoolExecutor(1, context, _follow_the_parent)
         future = executor.submit(work, garden)
         executor.shutdown(wait=False)  # the process ends after this garden
         return future
@@ -112,10 +113,17 @@ def _processes(workers: int) -> Iterator[Place]:
             process.terminate()
 
 
-def _leave_ctrl_c_to_the_parent() -> None:
-    """The parent terminates a process, which then removes its temporary files."""
+def _follow_the_parent() -> None:
+    """End with the parent, or when it says so, and remove temporary files; not by Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+
+
+def _end_with_the_parent() -> None:
+    if parent := multiprocessing.parent_process():
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 @contextmanager
