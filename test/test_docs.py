@@ -48,7 +48,19 @@ TOPIC_ROW = re.compile(r'^\| `/?([\w/]+)` \| (\w+) \|([^|]+)\|([^|]+)\|', re.MUL
 OTHER_TOPICS = re.compile(r'/(rosout|parameter_events|diagnostics|tf|\w+/transition_event)')
 TEST_NAME = re.compile(r'`(test_\w+\.py)::(\w+)`')
 # Programs of other packages, whose arguments are not checked.
-FOREIGN = {'dask', 'source', 'colcon', 'rviz2', 'rosdep', 'git', 'cd', 'mkdir', 'pip', 'sudo'}
+FOREIGN = {
+    'dask',
+    'export',
+    'source',
+    'colcon',
+    'rviz2',
+    'rosdep',
+    'git',
+    'cd',
+    'mkdir',
+    'pip',
+    'sudo',
+}
 FOREIGN_ROS = {'run robot_localization', 'launch nav2_bringup', 'bag record', 'topic echo'}
 
 

@@ -96,6 +96,7 @@ def place(trained, tmp_path, monkeypatch):
 
 def test_a_garden_is_trained_as_by_train_then_updated_and_never_loses_its_model(place, trained):
     shutil.copytree(trained.bag, place.folder / 'test' / 'again')
+    (place.folder / 'notes.txt').write_text('the gate was open')
     assert not place.is_up_to_date()
     state = garden.work(place)
     first, data = place.result(), place.model.read_bytes()

@@ -45,6 +45,12 @@ def recorded_files(path: Path) -> list[Path]:
         return [path]
 
 
+def is_bag(path: Path) -> bool:
+    """Whether a path has the name of a bag's file, or is a folder with a file of a bag."""
+    names = os.listdir(path) if path.is_dir() else [path.name]
+    return any(name.endswith((*SUFFIXES, METADATA)) for name in names)
+
+
 def _bag_files(folder: Path) -> list[str]:
     """Names of the files of a folder with suffixes of bags. Raises OSError."""
     return sorted(name for name in os.listdir(folder) if name.endswith(SUFFIXES))

@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import Any
 
 from sfa_localization import __version__
-from sfa_localization.bags.recording import recorded_files
+from sfa_localization.bags.recording import is_bag, recorded_files
 from sfa_localization.commands import evaluate, inspect, train
 from sfa_localization.data.errors import BagError, LocalizationError, ModelError
 from sfa_localization.data.files import read_text, write_json
@@ -44,10 +44,11 @@ class Garden:
         return self.output / 'model.npz'
 
     def bags(self, folder: str = '') -> list[Path]:
-        """All that is in the garden, or in a folder of it, beside its options."""
-        inside, others = self.folder / folder, (CONFIG, POINTS, TESTS)
+        """The bags in the garden, or in a folder of it."""
+        inside = self.folder / folder
         paths = sorted(inside.iterdir()) if inside.is_dir() else []
-        return [path for path in paths if path.name not in others and path.name[0] != '.']
+        paths = [path for path in paths if path.name != TESTS and path.name[0] != '.']
+        return [path for path in paths if is_bag(path)]
 
     def option(self, name: str, file: str) -> list[Path | str]:
         """The words of an option, if the garden has the file that it names."""
