@@ -72,12 +72,15 @@ def judgment(trained: Trained) -> tuple[str, str]:
         return BAD, 'The map cannot be used: the images hardly show where they were taken.'
     if expected > USEFUL_M:
         return BAD, 'The map cannot be used yet: see what to drive next.'
-    trusted = quality['certified'] and quality['left_out_within_95'] >= TRUSTED_SHARE
     care = too_sparse(trained.metric.poses, InspectionConfig().max_spacing)
     if quality.get('expected_yaw_error_deg', 0.0) > GOOD_DEG:
         care.append('images look alike at several headings, and perhaps at several places')
-    if expected > GOOD_M or not trusted:
-        care.append('see where it is weak')
+    if expected > GOOD_M:
+        care.append(f'expect an error of {expected:.2f} m from one image')
+    if not quality['certified']:
+        care.append('no certificate proves that no other map fits better')
+    if (share := quality['left_out_within_95']) < TRUSTED_SHARE:
+        care.append(f'its 95 % regions hold {share:.0%} of the images that were left out')
     if care:
         return WEAK, f'The map can be used with care: {"; ".join(care)}.'
     return GOOD, f'The map is good: expect an error of {expected:.2f} m from one image.'
