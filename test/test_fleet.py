@@ -2,13 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many gardens: each in its own process, what is left is the state, and a page tells of all."""
 
+import contextlib
 import json
 import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 from unittest import mock
 
+import psutil
 import pytest
 from cylinder_worlds import SMALL_RECIPE, write_bag
 
@@ -84,6 +88,22 @@ def test_ctrl_c_ends_the_processes_and_leaves_a_page(gardens, monkeypatch):
     code, results = gardens('--workers', '1', a='good', b='good')
     assert code == 130 and results == {} and '0 of 2 gardens' in gardens.page.read_text()
     assert all(child.join(60) is None for child in fleet.multiprocessing.active_children())
+
+
+def test_a_process_ends_with_a_parent_that_is_killed():
+    script = (
+        'import multiprocessing, os, time\n'
+        'from sfa_localization.commands import fleet\n'
+        'with fleet._processes(1) as (submit, _):\n'
+        '    submit(time.sleep, 600)\n'
+        '    print(multiprocessing.active_children()[0].pid, flush=True)\n'
+        '    time.sleep(3)\n'
+        '    os._exit(1)\n'
+    )
+    ended = subprocess.run([sys.executable, '-c', script], stdout=subprocess.PIPE, check=False)
+    assert ended.returncode == 1
+    with contextlib.suppress(psutil.NoSuchProcess):
+        psutil.Process(int(ended.stdout)).wait(timeout=60)
 
 
 @pytest.fixture

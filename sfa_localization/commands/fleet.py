@@ -33,6 +33,8 @@ for each garden model.npz, result.json and its page; index.html, a table of all 
 EXAMPLES = """\
   fleet gardens --output models --workers 4
   fleet gardens.yaml --output /shared/models --scheduler tcp://10.0.0.1:8786"""
+CLEAN_UP_S = 5.0
+"""For a process to remove its temporary files."""
 Place = tuple[Callable[..., 'Future[str]'], Callable[[], int]]
 """The `submit` of an executor, and the number of gardens that are worked on at once."""
 
@@ -124,6 +126,8 @@ def _end_with_the_parent() -> None:
     if parent := multiprocessing.parent_process():
         parent.join()
         os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(CLEAN_UP_S)
+        os._exit(1)  # the executor's loop outlives the signal
 
 
 @contextmanager
