@@ -22,7 +22,6 @@ MEASURES = {
     'slow features alone (m):': ('slow', 'mean_m'),
     'one image (m):': ('sfa', 'mean_m'),
     'EKF (m):': ('ekf', 'mean_m'),
-    'inside:': ('ekf', 'within_95'),
 }
 """Scores of a cell by their path."""
 
@@ -39,9 +38,10 @@ def table(cells: Cells) -> str:
         for cell in same:
             if cell.get('world', 0) == first:
                 values = (number(value_of(cell, *path)) for path in MEASURES.values())
-                rows.append([name, *values, extent])
+                inside = value_of(cell, 'ekf', 'within_95')
+                rows.append([name, *values, '-' if inside is None else f'{inside:.0%}', extent])
     worlds = gardens(len({cell.get('world') for cell in cells}))
-    return markdown(['tested in', *MEASURES, f'EKF in {worlds} (m):'], rows)
+    return markdown(['tested in', *MEASURES, 'inside:', f'EKF in {worlds} (m):'], rows)
 
 
 def condition(cell: Mapping[str, Any]) -> str:
