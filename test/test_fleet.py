@@ -134,6 +134,10 @@ def test_a_garden_is_trained_as_by_train_then_updated_and_never_loses_its_model(
     assert later['trained_s'] == first['trained_s'] != 0 and later['change_m'] == 0
 
     data = place.model.read_bytes()
+    shutil.copytree(trained.bag, place.folder / 'december' / 'drive')
+    assert not place.is_up_to_date() and garden.work(place) == 'weak'
+    assert 'december/drive: not used: bags lie directly' in place.result()['sentences'][0]
+    shutil.rmtree(place.folder / 'december')
     shutil.rmtree(place.folder / 'drive')
     (place.folder / 'later' / 'later.mcap').write_bytes(b'nothing')
     assert garden.work(place) == 'refused' and place.model.read_bytes() == data
@@ -171,7 +175,7 @@ def test_files_of_the_garden_are_its_options(trained, tmp_path):
 
 @pytest.mark.parametrize(('text', 'words'), [
     ('a: 1', 'must be a list'), ('', 'must be a list'), ('[', 'is not YAML'),
-    ('[a/x, b/x]', 'each with another name'), ('[models]', 'at least one folder'),
+    ('[a/x, b/x]', 'two folders have the name x'), ('[models]', 'holds no folder'),
 ])  # fmt: skip
 def test_a_bad_list_of_gardens_is_an_error(text, words, tmp_path, capsys):
     (tmp_path / 'gardens.yaml').write_text(text)

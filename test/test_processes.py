@@ -43,7 +43,9 @@ def ready(processes, name):
 
 
 def children():
-    return psutil.Process().children(recursive=True)
+    """The processes of the tests, without that which multiprocessing keeps until the end."""
+    every = psutil.Process().children(recursive=True)
+    return [child for child in every if 'resource_tracker' not in ' '.join(child.cmdline())]
 
 
 @pytest.fixture(autouse=True)

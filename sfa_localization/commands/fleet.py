@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
@@ -74,7 +74,8 @@ def run(arguments: argparse.Namespace) -> int:
         if result['state'] != 'good':
             print(f'{result["garden"]}: {result["state"]}: {result["sentences"][0]}')
     print(f'{output / "index.html"}: written')
-    return int(any(result['state'] == 'refused' for result in results))
+    refused = any(result['state'] == 'refused' for result in results)
+    return int(refused or len(results) < len(gardens))
 
 
 def _gardens(source: Path, output: Path) -> list[Garden]:
@@ -82,7 +83,8 @@ def _gardens(source: Path, output: Path) -> list[Garden]:
     from sfa_localization.commands.garden import Garden
 
     if source.is_dir():
-        paths = sorted(path for path in source.iterdir() if path.is_dir() and path.name[0] != '.')
+        inside = (path for path in sorted(source.iterdir()) if path.name[0] != '.')
+        paths = [path for path in inside if path.is_dir() or path.is_symlink()]
     else:
         try:
             listed = load_yaml(read_text(source, LONGEST, ConfigError))
@@ -90,10 +92,13 @@ def _gardens(source: Path, output: Path) -> list[Garden]:
             raise ConfigError(f'{source}: {error}') from None
         if not isinstance(listed, list):
             raise ConfigError(f'{source}: must be a list, with lines such as "- /bags/garden_1"')
-        paths = [source.parent / str(name) for name in listed]
-    folders = [path.resolve() for path in paths if path.resolve() != output]
-    if not folders or len({folder.name for folder in folders}) < len(folders):
-        raise ConfigError(f'{source}: name at least one folder, each with another name')
+        paths = [source.parent / Path(str(name)).expanduser() for name in listed]
+    folders = [Path(os.path.abspath(path)) for path in paths if path.resolve() != output]
+    names = Counter(folder.name for folder in folders)
+    if not folders or names.total() > len(names):
+        twice = ', '.join(name for name, count in names.items() if count > 1)
+        problem = f'two folders have the name {twice}' if twice else 'holds no folder'
+        raise ConfigError(f'{source}: {problem}: give each garden a folder of another name')
     return [Garden(folder, output / folder.name) for folder in folders]
 
 
@@ -163,6 +168,10 @@ def _work_on(gardens: Sequence[Garden], place: Place, total: int) -> None:
                     failed.add(garden)
                     waiting.append(garden)
                     continue
-                state = give_up(garden, error) if error else future.result()
+                try:
+                    state = give_up(garden, error) if error else future.result()
+                except LocalizationError as unwritten:
+                    bar.write(f'{garden.output.name}: refused: {unwritten}', file=sys.stderr)
+                    state = 'refused'
                 refused += state == 'refused'
                 bar.update()

@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import Any
 
 from sfa_localization import __version__
-from sfa_localization.bags.recording import is_bag, recorded_files
+from sfa_localization.bags.recording import METADATA, is_bag, recorded_files
 from sfa_localization.commands import evaluate, inspect, train
 from sfa_localization.data.errors import BagError, LocalizationError, ModelError
 from sfa_localization.data.files import read_text, write_json
@@ -46,9 +46,18 @@ class Garden:
     def bags(self, folder: str = '') -> list[Path]:
         """The bags in the garden, or in a folder of it."""
         inside = self.folder / folder
+        if (inside / METADATA).is_file():
+            return [inside]
         paths = sorted(inside.iterdir()) if inside.is_dir() else []
         paths = [path for path in paths if path.name != TESTS and path.name[0] != '.']
         return [path for path in paths if is_bag(path)]
+
+    def unread(self) -> list[Judgment]:
+        """A judgment on each bag that lies too deep in the garden."""
+        deep = (path for path in sorted(self.folder.glob('*/*')) if path.parent.name != TESTS)
+        bags = [path for path in deep if path.is_dir() and is_bag(path)]
+        text = 'not used: bags lie directly in the folder of a garden'
+        return [{'grade': WEAK, 'sentence': f'{bag}: {text}'} for bag in bags]
 
     def option(self, name: str, file: str) -> list[Path | str]:
         """The words of an option, if the garden has the file that it names."""
@@ -71,7 +80,7 @@ class Garden:
         """Whether the last run read the same files, and its model is there."""
         result = self.result()
         done = self.model.is_file() or result.get('grade') == BAD
-        return done and bool(result.get('inputs') == self.inputs())
+        return done and bool(result.get('inputs') == self.inputs()) and not self.unread()
 
     def write(self, result: Mapping[str, Any], judgments: Sequence[Judgment]) -> str:
         """Write a result with judgments, the worst first; the state. Raises LocalizationError."""
@@ -101,13 +110,15 @@ def work(garden: Garden) -> str:
             training, *updates = _learn(garden, result, inputs)
             model = PlaceModel.load(garden.model)
             judgments = [training, *updates, *_evaluate(garden, 'points' in model.quality)]
+            judgments += garden.unread()
             error_m = model.quality['expected_error_m']
             result['change_m'] = error_m - result.get('expected_error_m', error_m)
             result['expected_error_m'] = error_m
             result['area_m2'] = model.ground.cells(GroundConfig()).area_m2
             result['trained_s'] = (garden.output / TRAINING).stat().st_mtime
         except LocalizationError as error:
-            judgments = [{'grade': BAD, 'sentence': str(error)}]
+            stays = '; the earlier model stays' if garden.model.is_file() else ''
+            judgments = [{'grade': BAD, 'sentence': f'{error}{stays}'}, *garden.unread()]
     return garden.write({**result, 'inputs': inputs}, judgments)
 
 
@@ -140,7 +151,8 @@ def _train(garden: Garden, config: Sequence[Path | str]) -> Judgment:
     """Inspect and train, with a page of each."""
     drives, output = garden.bags(), garden.output
     if not drives:
-        raise BagError(f'{garden.folder}: holds no bag: record one into this folder')
+        problem = 'holds no bag' if garden.folder.is_dir() else 'is no folder'
+        raise BagError(f'{garden.folder}: {problem}: record a bag into it')
     report = '--report', output / 'inspection'
     _run(inspect, output / 'inspection.json', *drives, *config, *report)
     words = [*drives, *config, *garden.option('--points', POINTS)]
