@@ -160,8 +160,8 @@ def _judged(
     axes = [1.0, 1.0, 1.0 if truth.headings else np.nan]
     estimates = {name: Trajectory(p.stamps_ns, p.poses * axes) for name, p in poses.items()}
     scores = {name: score(truth.poses, estimate) for name, estimate in estimates.items()}
+    turn = rotation(transform.yaw_rad)
     for name, track in tracks.items():
-        turn = rotation(transform.yaw_rad)
         scores[name] |= calibration(truth.poses, estimates[name], turn, track.covariances)
         scores[name]['similarity'] = similarity(truth.poses, estimates[name])
     localised = np.array([level is Level.LOCALISED for _, level, state in outputs if state])

@@ -47,8 +47,8 @@ def recorded_files(path: Path) -> list[Path]:
 
 def is_bag(path: Path) -> bool:
     """Whether a path has the name of a bag's file, or is a folder with a file of a bag."""
-    names = os.listdir(path) if path.is_dir() else [path.name]
-    return any(name.endswith((*SUFFIXES, METADATA)) for name in names)
+    files = path.glob('*') if path.is_dir() else [path]
+    return any(file.name.endswith((*SUFFIXES, METADATA)) for file in files)
 
 
 def _bag_files(folder: Path) -> list[str]:
@@ -119,9 +119,7 @@ class Recording:
             self.problems.append(f'{METADATA} is damaged ({error}); rebuilt from the files, as '
                                  '`ros2 bag reindex` does for good')  # fmt: skip
         if not files:
-            suffixes = (*SUFFIXES, METADATA)
-            files_inside = (file for file in self.path.glob('*/*') if file.name.endswith(suffixes))
-            inside = {file.parent.name for file in files_inside}
+            inside = [path.name for path in self.path.glob('*') if path.is_dir() and is_bag(path)]
             if inside:
                 bags = listed(sorted(inside))
                 raise BagError(f'{self.path}: is no bag; it holds the bags {bags}: name them')

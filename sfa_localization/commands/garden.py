@@ -110,7 +110,6 @@ def work(garden: Garden) -> str:
             training, *updates = _learn(garden, result, inputs)
             model = PlaceModel.load(garden.model)
             judgments = [training, *updates, *_evaluate(garden, 'points' in model.quality)]
-            judgments += garden.unread()
             error_m = model.quality['expected_error_m']
             result['change_m'] = error_m - result.get('expected_error_m', error_m)
             result['expected_error_m'] = error_m
@@ -118,8 +117,8 @@ def work(garden: Garden) -> str:
             result['trained_s'] = (garden.output / TRAINING).stat().st_mtime
         except LocalizationError as error:
             stays = '; the earlier model stays' if garden.model.is_file() else ''
-            judgments = [{'grade': BAD, 'sentence': f'{error}{stays}'}, *garden.unread()]
-    return garden.write({**result, 'inputs': inputs}, judgments)
+            judgments = [{'grade': BAD, 'sentence': f'{error}{stays}'}]
+    return garden.write({**result, 'inputs': inputs}, [*judgments, *garden.unread()])
 
 
 def give_up(garden: Garden, error: BaseException) -> str:

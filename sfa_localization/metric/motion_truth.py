@@ -14,6 +14,7 @@ distribution. Estimates that are judged take no part.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -25,7 +26,7 @@ from scipy.sparse import csr_array
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_angle
-from sfa_localization.data.run import Points, Trajectory
+from sfa_localization.data.run import Points, Stamps, Trajectory
 from sfa_localization.data.statistics import LENGTH_TO_STD, evenly, outlier_factor, surprise
 from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack
 from sfa_localization.metric.motion_samples import OUTLIER, fault_sentence, faulty
@@ -234,10 +235,11 @@ class _Comparison:
         std = min((other.std for other, _ in fits), default=NOISE_M)
         return min(fits, key=lambda item: item[0].cost(std) + item[1], default=(fit, 0.0))[0]
 
-    def agreed(self, free: Mask) -> _Fit | None:
-        """The best fit without faulty samples, which are no longer `used`; None without enough
-        motion. One of another motion is unsteady.
+    def agreed(self, open_loop: bool) -> _Fit | None:
+        """The best fit without faulty samples, which are no longer `used`, and without a delay for
+        `open_loop` odometry; None without enough motion. One of another motion is unsteady.
         """
+        free = np.array([True, True, not open_loop, True])
         self.used = ~self.faults(None)
         fit = self.best(free)
         if fit is None or fit.unsteady > UNSTEADY:
@@ -315,14 +317,14 @@ def true_poses(
     Only odometry that is `trusted` refutes a truth. `open_loop` odometry repeats commands, which
     the robot follows later: it shows no delay. Raises DataError for the truth of another drive.
     """
-    comparison, free = _Comparison(truth, track), np.array([True, True, not open_loop, True])
+    comparison = _Comparison(truth, track)
     factor = comparison.scale()
     if factor < 1e-9 and trusted:
         raise DataError(f'{TRUTH} does not move with the robot: is its topic the right one?')
     factor = max(factor, 1e-9)
     unit = min(_UNITS, key=lambda unit: abs(np.log(factor / unit)))
     comparison.places /= unit
-    fit = comparison.agreed(free)
+    fit = comparison.agreed(open_loop)
     if fit is None or (fit.unsteady > UNSTEADY and not trusted):
         return TruePoses(truth)
     if fit.unsteady > UNSTEADY:
@@ -343,6 +345,14 @@ def _differences(fit: _Fit) -> list[str]:
     return [*texts, f'lies {ahead} and {side}; taken into account'] if x or y else texts
 
 
+def _sentences(
+    source: str, texts: Sequence[str], comparison: _Comparison, stamps_ns: Stamps
+) -> list[str]:
+    """Sentences on a source, from the words after its name, and on the samples not used."""
+    faults = fault_sentence(source, ~comparison.used, stamps_ns, 'odometry')
+    return [*(f'{source} {text}' for text in texts), *filter(None, [faults])]
+
+
 def _corrected(truth: Trajectory, comparison: _Comparison, fit: _Fit, unit: float) -> TruePoses:
     """The truth after all corrections; itself if there are none."""
     yaw, text, headings = comparison.headings(fit)
@@ -350,8 +360,7 @@ def _corrected(truth: Trajectory, comparison: _Comparison, fit: _Fit, unit: floa
     if fit.mirrored:
         texts.append('is mirrored (y to the right, or x and y swapped); turned around')
     texts += [*_differences(fit), *filter(None, (text, comparison.jumps(fit)))]
-    faults = fault_sentence(TRUTH, ~comparison.used, truth.stamps_ns, 'odometry')
-    sentences = [f'{TRUTH} {text}' for text in texts] + [faults] * bool(faults)
+    sentences = _sentences(TRUTH, texts, comparison, truth.stamps_ns)
     if not sentences:
         return TruePoses(truth)
     places = comparison.places.conj() if fit.mirrored else comparison.places
@@ -372,7 +381,7 @@ def timed_points(
     """
     places = np.column_stack([points.places.real, points.places.imag, np.zeros(len(points))])
     comparison = _Comparison(Trajectory(points.stamps_ns, places), track)
-    fit = comparison.agreed(np.array([True, True, not open_loop, True]))
+    fit = comparison.agreed(open_loop)
     alike = fit and not fit.mirrored and fit.unsteady <= UNSTEADY
     if not fit or not alike or not 1 / EQUAL < comparison.scale() < EQUAL:
         return points, []
@@ -382,6 +391,5 @@ def timed_points(
         (name, stamp_ns - late_ns, place, std, lever or known)
         for name, stamp_ns, place, std, known in points.rows()
     ]
-    faults = fault_sentence(POINTS, ~comparison.used, points.stamps_ns, 'odometry')
-    texts = [f'{POINTS} {text}' for text in _differences(fit)] + [faults] * bool(faults)
+    texts = _sentences(POINTS, _differences(fit), comparison, points.stamps_ns)
     return Points.of([timed[row] for row in rows]), texts
