@@ -14,6 +14,7 @@ from sfa_localization.camera import body
 from sfa_localization.camera.kinds import require_single_view
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings, turns_and_textures
+from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.progress import announce, progress_bar
 from sfa_localization.data.run import Run
@@ -26,7 +27,7 @@ from sfa_localization.keyframes.leveling import leveled_runs
 from sfa_localization.keyframes.texture import channels
 from sfa_localization.metric.dead_reckoning import OdometryTrack
 from sfa_localization.metric.drives import Drive, Drives
-from sfa_localization.metric.motion_check import MotionCheck, check_drives
+from sfa_localization.metric.motion_check import MotionCheck, check_motion
 from sfa_localization.metric.motion_truth import timed_points
 from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.odometry_errors import same_scale
@@ -157,28 +158,34 @@ def compared(
     """
     if not force:
         require_single_view(runs)
-    images = [turns_and_textures(run.panoramas, recipe.panorama.clockwise) for run in runs]
-    turns, textures = zip(*images, strict=True)
-    commands = [OpenLoop.of(run.odometry.twists).repeats for run in runs]
-    corrected, checks = check_drives(runs, turns, force, textures, commands)
+    corrected, checks = zip(*(_compared(run, recipe, force) for run in runs), strict=True)
+    return corrected, checks
+
+
+def _compared(run: Run, recipe: Recipe, force: bool) -> tuple[Run, MotionCheck]:
+    """A drive as its own comparison corrects it: its measured points, too, by the odometry."""
+    turns, textures = turns_and_textures(run.panoramas, recipe.panorama.clockwise)
+    commands, stamps_ns = OpenLoop.of(run.odometry.twists).repeats, run.panoramas.stamps_ns
+    images, views = (stamps_ns, turns), (stamps_ns, textures)
+    check = check_motion(run.odometry, images, run.yaw_rate, views=views, commands=commands)
+    _warn(run, [*check.corrected, *check.notes, *(check.wrong if force else [])])
+    if check.wrong and not force:
+        raise DataError(f'{run.name}: {"; ".join(check.wrong)} (train --force goes on)')
+    corrected = check.run(run)
     if recipe.segments.yaw_source == 'gyro':  # on request also a gyroscope that was rejected
-        corrected = tuple(
-            replace(run, yaw_rate=run.yaw_rate or recorded.yaw_rate)
-            for run, recorded in zip(corrected, runs, strict=True)
-        )
-    return tuple(map(_with_timed_points, corrected, commands, checks)), checks
+        corrected = replace(corrected, yaw_rate=corrected.yaw_rate or run.yaw_rate)
+    if run.points is not None:
+        track = OdometryTrack.of(corrected.odometry, SegmentConfig(), corrected.yaw_rate)
+        points, texts = timed_points(run.points, track, commands)
+        _warn(run, texts)
+        check.corrected.extend(texts)
+        corrected = replace(corrected, points=points)
+    return corrected, check
 
 
-def _with_timed_points(run: Run, commands: bool, check: MotionCheck) -> Run:
-    """A drive with its measured points as compared with the odometry."""
-    if run.points is None:
-        return run
-    track = OdometryTrack.of(run.odometry, SegmentConfig(), run.yaw_rate)
-    points, texts = timed_points(run.points, track, commands)
-    check.corrected.extend(texts)
+def _warn(run: Run, texts: Sequence[str]) -> None:
     for text in texts:
         logger.warning('%s: %s', run.name, text)
-    return replace(run, points=points)
 
 
 def _warn_of_bodies(runs: Sequence[Run], views: Textures, sphere: Sphere) -> None:
@@ -188,8 +195,7 @@ def _warn_of_bodies(runs: Sequence[Run], views: Textures, sphere: Sphere) -> Non
         textures, stamps = views.textures[views.run == number], run.panoramas.stamps_ns
         chosen = evenly(len(stamps), body.IMAGES)
         headings = run.odometry.trajectory.at(stamps[chosen])[:, 2]
-        for text in body.sentences(body.bodies(textures[chosen][:, rows], headings, sphere)):
-            logger.warning('%s: %s', run.name, text)
+        _warn(run, body.sentences(body.bodies(textures[chosen][:, rows], headings, sphere)))
 
 
 def drive_of(run: Run) -> Drive:

@@ -16,7 +16,6 @@ from metric_worlds import criss_cross, drive, lanes, meander
 
 from sfa_localization.bags.drives import read_drive
 from sfa_localization.bags.writer import BagWriter
-from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.data.errors import CameraError, DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.run import (
@@ -31,7 +30,7 @@ from sfa_localization.data.run import (
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
 from sfa_localization.metric.breaks import parted
 from sfa_localization.metric.dead_reckoning import OdometryTrack
-from sfa_localization.metric.motion_check import check_drives, check_motion
+from sfa_localization.metric.motion_check import check_motion
 from sfa_localization.metric.motion_sources import (
     IMAGES,
     POSE,
@@ -41,6 +40,7 @@ from sfa_localization.metric.motion_sources import (
 from sfa_localization.metric.motion_truth import TruePoses, timed_points, true_poses
 from sfa_localization.metric.settings import SegmentConfig
 from sfa_localization.training import train
+from sfa_localization.training_input import Recipe, compared
 
 
 def rows(odometry: Odometry, chosen) -> Odometry:
@@ -90,9 +90,7 @@ def sample(tmp_path_factory) -> Run:
 
 def checked(run: Run, force: bool = False):
     """The run that is learned from, and the comparison of its sources of motion."""
-    turns = VisualGyro()
-    headings = [turns.add(image) for image in run.panoramas.images]
-    (run,), (check,) = check_drives([run], [headings], force)
+    (run,), (check,) = compared([run], Recipe(), force)
     return run, check
 
 
@@ -289,7 +287,8 @@ def test_a_clock_that_drifts_is_followed_along_the_drive(late, said, rate):
         gyro = replace(gyro, stamps_ns=shifted(gyro.stamps_ns, rate))
     panoramas = PanoramaArray(images, np.zeros((len(images), 1, 1, 3), np.uint8))
     recorded = Run('run', panoramas, run.odometry, gyro)
-    (corrected,), (check,) = check_drives([recorded], [run.poses[:, 2]])
+    check = check_motion(recorded.odometry, (images, run.poses[:, 2]), gyro)
+    corrected = check.run(recorded)
     fast = (rate > 0) == (late != 'both')
     text = f'{said} clock runs {abs(rate):.2%} {"fast" if fast else "slow"}: taken into account'
     assert check.wrong == [] and check.corrected == [text.replace('%', ' %')] * (rate != 0)

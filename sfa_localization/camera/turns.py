@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import BATCH, Image, Panoramas
 from sfa_localization.data.statistics import parabola_peak
 
@@ -115,12 +115,12 @@ def _shift(before: Texture, after: Texture) -> _Shift:
 
 def turns_and_textures(
     panoramas: Panoramas, clockwise: bool = True
-) -> tuple[list[float], NDArray[np.int8]]:
+) -> tuple[Array, NDArray[np.int8]]:
     """Headings rad, and textures (N, rows, columns), of N panoramas by a `VisualGyro`."""
     gyro = VisualGyro(clockwise)
     images = (image for batch in panoramas.batches(BATCH) for image in batch)
     yaws, textures = zip(*((gyro.add(image), gyro.texture) for image in images), strict=True)
-    return list(yaws), np.stack(textures)
+    return np.array(yaws), np.stack(textures)
 
 
 def headings(panoramas: Panoramas, clockwise: bool = True) -> Iterator[float]:

@@ -8,16 +8,13 @@ one vote together.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array, Complex, Indices, relative, wrap_angle
 from sfa_localization.data.odometry_steps import JUMP, NOISE
@@ -41,8 +38,6 @@ from sfa_localization.metric.motion_sources import (
     sources_of,
     unit,
 )
-
-logger = logging.getLogger(__name__)
 
 SKIDDING = 5.0
 """Skidding wheels are off by a factor of two: more is another unit, axis or source."""
@@ -102,6 +97,16 @@ class MotionCheck:
         devices = [{pair.a, pair.b} - {TWIST} for pair in alike]
         return {POSE, IMAGES} in devices or any(GYRO in each and len(each) > 1 for each in devices)
 
+    def run(self, recorded: Run) -> Run:
+        """The compared drive with its corrected odometry, gyroscope and clock of the images."""
+        run = replace(recorded, odometry=self.odometry, yaw_rate=self.gyro)
+        if self.image_drift is None:
+            return run
+        stamps_ns = run.panoramas.stamps_ns
+        stamps_ns = stamps_ns - self.image_drift.late_ns(stamps_ns)
+        panoramas = replace(run.panoramas, stamps_ns=stamps_ns)  # type: ignore[type-var]
+        return replace(run, panoramas=panoramas)
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         rows = [dict(zip(HEAD, pair.row(), strict=True)) for pair in self.pairs]
@@ -115,41 +120,6 @@ class MotionCheck:
         table = ['  '.join(map(str.ljust, row, widths)).rstrip() for row in rows]
         corrected = [f'corrected: {text}' for text in self.corrected]
         return [*table, *corrected, *(f'note: {text}' for text in self.notes)]
-
-
-def check_drives(
-    runs: Sequence[Run],
-    headings: Sequence[Sequence[float]],
-    force: bool = False,
-    textures: Sequence[NDArray[np.int8] | None] = (),
-    commands: Sequence[bool] = (),
-) -> tuple[tuple[Run, ...], tuple[MotionCheck, ...]]:
-    """Corrected drives, and the comparisons of their sources of motion.
-
-    `headings` (N,) rad of each run are the sums of the shifts between its images, and `textures`
-    (N, rows, columns) small versions of these, which show breaks. `commands`: whether its odometry
-    repeats commands. Raises DataError if a source is wrong; with `force` it only warns.
-    """
-    checks, corrected, count = [], [], len(runs)
-    items = zip(
-        runs, headings, textures or [None] * count, commands or [False] * count, strict=True
-    )
-    for run, yaw, small, repeats in items:
-        stamps_ns = run.panoramas.stamps_ns
-        views = None if small is None else (stamps_ns, small)
-        images = stamps_ns, np.asarray(yaw, float)
-        check = check_motion(run.odometry, images, run.yaw_rate, views=views, commands=repeats)
-        for text in check.corrected + check.notes + (check.wrong if force else []):
-            logger.warning('%s: %s', run.name, text)
-        if check.wrong and not force:
-            raise DataError(f'{run.name}: {"; ".join(check.wrong)} (train --force goes on)')
-        checks.append(check)
-        if check.image_drift:
-            stamps_ns = stamps_ns - check.image_drift.late_ns(stamps_ns)
-            panoramas = replace(run.panoramas, stamps_ns=stamps_ns)  # type: ignore[type-var]
-            run = replace(run, panoramas=panoramas)
-        corrected.append(replace(run, odometry=check.odometry, yaw_rate=check.gyro))
-    return tuple(corrected), tuple(checks)
 
 
 def check_motion(
