@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sfa_localization.commands import options
 from sfa_localization.data.errors import ConfigError, LocalizationError
@@ -147,7 +147,7 @@ def _cluster(address: str) -> Iterator[Place]:
 
 def _work_on(gardens: Sequence[Garden], place: Place, total: int) -> None:
     """Work on the gardens that changed, of a total; give up those whose work fails twice."""
-    from sfa_localization.commands.garden import give_up, work
+    from sfa_localization.commands.garden import work
 
     submit, limit = place
     waiting, refused = deque(gardens), 0
@@ -161,17 +161,28 @@ def _work_on(gardens: Sequence[Garden], place: Place, total: int) -> None:
             bar.set_description_str(f'running {len(running)}, refused {refused}', refresh=False)
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 garden = running.pop(future)
-                if future.cancelled():
-                    raise LocalizationError('the scheduler has ended: start it, and repeat this')
-                error = future.exception()
-                if error and garden not in failed:
+                if _has_failed(future) and garden not in failed:
                     failed.add(garden)
                     waiting.append(garden)
                     continue
-                try:
-                    state = give_up(garden, error) if error else future.result()
-                except LocalizationError as unwritten:
-                    bar.write(f'{garden.output.name}: refused: {unwritten}', file=sys.stderr)
-                    state = 'refused'
-                refused += state == 'refused'
+                refused += _state(garden, future, bar) == 'refused'
                 bar.update()
+
+
+def _has_failed(future: Future[str]) -> bool:
+    """Whether the work ended in an error. Raises LocalizationError if it was never begun."""
+    if future.cancelled():
+        raise LocalizationError('the scheduler has ended: start it, and repeat this')
+    return future.exception() is not None
+
+
+def _state(garden: Garden, future: Future[str], bar: Any) -> str:
+    """The state of a garden after its work, or after its second error."""
+    from sfa_localization.commands.garden import give_up
+
+    error = future.exception()
+    try:
+        return give_up(garden, error) if error else future.result()
+    except LocalizationError as unwritten:
+        bar.write(f'{garden.output.name}: refused: {unwritten}', file=sys.stderr)
+        return 'refused'

@@ -33,7 +33,6 @@ from study.trials import STRAIGHT, features_of, slow_of, turned_of
 RESULTS = 'matrix.json'
 Condition = tuple[str, str]
 """Light and season."""
-TRAINED = 'day'
 TESTS = (
     ('day', 'summer'), ('morning', 'summer'), ('overcast', 'summer'), ('evening', 'summer'),
     ('overcast', 'autumn'), ('day', 'winter'),
@@ -43,7 +42,7 @@ TESTS = (
 def fill_matrix(out: Path, config: StudyConfig, progress: Progress) -> list[Cell]:
     """Judge all conditions; write JSON and a table below `out`. Returns the cells.
 
-    A cell has `trained`, `light` and `season`, the scores that `judged` names, and those of `slow`
+    A cell has `world`, `light` and `season`, the scores that `judged` names, and those of `slow`
     features alone and of the `paper`'s recipe. Raises LocalizationError, also for a folder with
     results of other settings.
     """
@@ -58,15 +57,13 @@ def fill_matrix(out: Path, config: StudyConfig, progress: Progress) -> list[Cell
 
 
 def _is_done(results: Results, test: Condition) -> bool:
-    return results.find(trained=TRAINED, light=test[0], season=test[1]) is not None
+    return results.find(light=test[0], season=test[1]) is not None
 
 
 def _fill(garden: SmallGarden, tests: Sequence[Condition], keep: Callable[[Cell], None]) -> None:
     """Train once and test in some lights; `keep` receives every finished cell."""
-    training = garden.drive(
-        f'train_{TRAINED}', 1, trajectory='coverage', light=TRAINED, season='summer'
-    )
-    model, transform = garden.model(TRAINED, training), None
+    training = garden.drive('train_day', 1, trajectory='coverage', light='day', season='summer')
+    model, transform = garden.model('day', training), None
     recipe = as_live(Recipe(), model.panorama)
     cache = image_folder(garden.folder / 'images')
     paper = _paper_recipe(model, _read(training, cache / training.name, recipe))
@@ -79,7 +76,7 @@ def _fill(garden: SmallGarden, tests: Sequence[Condition], keep: Callable[[Cell]
         cell['paper'] = paper(run)
         if transform is not None:
             cell['slow'] = _slow_alone(model, run, transform)
-        keep({'trained': TRAINED, 'light': light, 'season': season, **cell})
+        keep({'world': garden.world, 'light': light, 'season': season, **cell})
 
 
 def _read(bag: Path, cache: Path, recipe: Recipe) -> Run:

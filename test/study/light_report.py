@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Table of a training by day that is tested in all lights and seasons, in one or more gardens.
 
-A cell is a mapping with `trained`, `light` and `season`, and the scores that `light` gives; a score
+A cell is a mapping with `world`, `light` and `season`, and the scores that `light` gives; a score
 that does not exist is None or missing.
 """
 

@@ -111,8 +111,6 @@ def _add(record: Record, file: Path) -> None:
             columns = cells[0]['columns']
             record['quick'][name] = _rounded({c: columns[c] for c in (*RECIPES, 'ours')})
         return
-    if name == 'light':
-        cells = [{'world': settings['world'], **c} for c in cells if c['trained'] == light.TRAINED]
     kept = {_names(cell): cell for cell in [*record['results'].get(name, []), *cells]}
     record['results'][name] = _rounded([*kept.values()])
     if name in ROUTES:
