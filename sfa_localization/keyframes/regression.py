@@ -191,7 +191,8 @@ def _regression(products: Array, basis: _Basis) -> tuple[Array, Array, Array, fl
     kept = max(float(nuisance[0] @ products[:, count]) / square, 0.0)
     unexplained = max(float(combine[0] @ products @ combine[0]) / square, 0.0)
     unlike = (unexplained + _TINY) / (kept**2 + _TINY**2)
-    return combine, basis.mean - solution[0] @ basis.centered, along[1:, -1], unlike
+    shares, changes = basis.mean - solution[0] @ basis.centered, -combine[0, count + 1 :]
+    return combine, shares, changes, unlike
 
 
 def _moved_by_sectors(
