@@ -216,7 +216,7 @@ def extended(model: PlaceModel, new: Additions, name: str) -> PlaceModel:
     if not len(new):
         return model
     old, rows = model.keyframes, _kept(model.keyframes, new.poses)
-    values, _ = encoded(new.textures, new.poses, old.sphere, old.step)
+    values, _ = encoded(new.textures, new.poses, old.sphere, old.seen, old)
     keyframes = replace(
         old,
         values=np.concatenate([old.values[rows], values]),

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, Indices
+from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.run import Odometry, Run, Stamps
 from sfa_localization.data.statistics import evenly
 from sfa_localization.keyframes.texture import (
@@ -67,17 +67,20 @@ class Closures:
 @dataclass(frozen=True, slots=True)
 class Textures:
     """Images in driving order: `textures` (S, rows, columns), their indices `images` (S,) among
-    those of all drives, the drive `run` (S,) and the distance driven in it until each, (S,) m.
+    those of all drives, the drive `run` (S,) and the distance driven in it until each, (S,) m. They
+    show what is `seen` (rows, columns), by default all.
     """
 
     textures: NDArray[np.int8]
     images: Indices
     run: Indices
     path_m: Array
+    seen: Mask | None = None
 
     def take(self, rows: NDArray[Any]) -> Textures:
         """Some of the images, by a mask (S,) or indices."""
-        return Textures(self.textures[rows], self.images[rows], self.run[rows], self.path_m[rows])
+        parts = self.textures[rows], self.images[rows], self.run[rows], self.path_m[rows]
+        return Textures(*parts, self.seen)
 
     def near(self, row: int, rows: Indices) -> NDArray[np.bool_]:
         """Which of the images `rows` (M,) are of the same stretch of driving as another one."""

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array, Indices
+from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.keyframes.errors import ErrorModel
+from sfa_localization.keyframes.hidden import completed, masked, turned_mask
 from sfa_localization.keyframes.regression import Fit, regress
 from sfa_localization.keyframes.texture import (
     COARSE,
@@ -50,7 +51,8 @@ class Keyframes:
     They are stored as the spectra of images with yaw 0: `values` (K, F, 2 rows) int8, real and
     imaginary parts in turn, in units of `step`. `drives` (K,) are the numbers of their drives, of
     which the first `trained` were those of the training; drives of the training in the same light
-    share a number. `errors` says how well images are located among them.
+    share a number. `errors` says how well images are located among them. Images show what is `seen`
+    (rows, columns), by default all; what keyframes did not see is filled in: see hidden.py.
     """
 
     values: NDArray[np.int8]
@@ -61,19 +63,25 @@ class Keyframes:
     sphere: Sphere
     drives: NDArray[np.int32]
     trained: int
+    seen: Mask | None = None
 
     @classmethod
     def of(
-        cls, textures: NDArray[np.int8], poses: Array, sphere: Sphere, drives: NDArray[np.int32]
+        cls,
+        textures: NDArray[np.int8],
+        poses: Array,
+        sphere: Sphere,
+        drives: NDArray[np.int32],
+        seen: Mask | None = None,
     ) -> Keyframes:
         """Keyframes of the training by quantized textures (K, rows, columns). Raises DataError for
         too few.
         """
         if len(poses) < FEWEST:
             raise DataError(f'{len(poses)} images are too few for keyframes')
-        values, step = encoded(textures, poses, sphere)
-        trained = int(drives.max()) + 1
-        return cls(values, step, textures.shape[2], poses, ErrorModel(), sphere, drives, trained)
+        values, step = encoded(textures, poses, sphere, seen)
+        columns, trained = textures.shape[2], int(drives.max()) + 1
+        return cls(values, step, columns, poses, ErrorModel(), sphere, drives, trained, seen)
 
     def take(self, rows: NDArray[Any]) -> Keyframes:
         """Some of the keyframes, by a mask (K,) or indices."""
@@ -154,7 +162,11 @@ class Keyframes:
         by_turn = image * (1j * np.arange(image.shape[1])).astype(np.complex64)
         changes = turned(np.concatenate([image[None], slopes, by_turn[None]]), self.sign * yaw)
         places, drives = self.poses[rows, :2], self.drives[rows]
-        fit = regress(changes, self.aligned(rows), places, drives, self.channels, self.columns)
+        keyframes = self.aligned(rows)
+        if self.seen is not None:
+            seen = turned_mask(self.seen, self.sign * yaw)
+            changes, keyframes = masked(changes, seen), masked(keyframes, seen)
+        fit = regress(changes, keyframes, places, drives, self.channels, self.columns)
         facing, turn = complex(fit.shares @ np.exp(1j * self.poses[rows, 2])), float(fit.changes[2])
         yaw, residual = yaw - self.sign * turn, turned(fit.residual, -turn)
         return dataclasses.replace(fit, yaw=yaw, facing=facing, residual=residual)
@@ -163,6 +175,7 @@ class Keyframes:
         """Arrays to save, without pickle."""
         names = 'values', 'step', 'columns', 'poses', 'drives', 'trained'
         arrays = {name: np.asarray(getattr(self, name)) for name in names}
+        arrays |= {} if self.seen is None else {'seen': self.seen}
         return {**arrays, 'errors': np.array(dataclasses.astuple(self.errors))}
 
     @classmethod
@@ -172,16 +185,30 @@ class Keyframes:
         poses, drives = arrays['poses'].astype(float), arrays['drives'].astype(np.int32)
         errors = ErrorModel(*arrays['errors'].astype(float).tolist())
         columns, trained = int(arrays['columns']), int(arrays['trained'])
-        return cls(values, step, columns, poses, errors, sphere, drives, trained)
+        seen = np.asarray(arrays['seen'], bool) if 'seen' in arrays else None
+        return cls(values, step, columns, poses, errors, sphere, drives, trained, seen)
 
 
 def encoded(
-    textures: NDArray[np.int8], poses: Array, sphere: Sphere, step: float = 0.0
+    textures: NDArray[np.int8],
+    poses: Array,
+    sphere: Sphere,
+    seen: Mask | None = None,
+    others: Keyframes | None = None,
 ) -> tuple[NDArray[np.int8], float]:
-    """`Keyframes.values` of textures (K, rows, columns) with poses (K, 3), and their step, by
-    default the one with which the largest value is 127: one thousandth of their squares is lost.
+    """`Keyframes.values` of textures (K, rows, columns) with poses (K, 3), and their step: the one
+    of `others`, or the one with which the largest value is 127: one thousandth of their squares is
+    lost. What textures have not `seen` (rows, columns) is filled in from all these keyframes.
     """
-    spectra = turned(spectra_of(textures), poses[:, 2] * (1 if sphere.clockwise else -1))
+    angles = poses[:, 2] * (1 if sphere.clockwise else -1)
+    spectra, places = turned(spectra_of(textures), angles), poses[:, :2]
+    if seen is not None:
+        masks = np.stack([turned_mask(seen, angle) for angle in angles.tolist()])
+        if others is not None:
+            spectra = np.concatenate([spectra, others.aligned(slice(None))])
+            places = np.concatenate([places, others.poses[:, :2]])
+            masks = np.concatenate([masks, np.ones((len(others.poses), *seen.shape), bool)])
+        spectra = completed(spectra, masks, places, NEIGHBORS)[: len(poses)]
     parts = spectra.swapaxes(1, 2).copy().view(np.float32)
-    step = step or max(float(np.abs(parts).max()) / 127, 1e-9)
+    step = others.step if others else max(float(np.abs(parts).max()) / 127, 1e-9)
     return np.rint(parts / step).clip(-127, 127).astype(np.int8), step

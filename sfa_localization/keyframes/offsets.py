@@ -58,7 +58,7 @@ def find_offsets(views: Textures, poses: Array, sphere: Sphere) -> Offsets:
     if len(poses) < FEWEST:
         return Offsets.none()
     drives = views.run.astype(np.int32)
-    keyframes = Keyframes.of(views.textures, poses, sphere, drives)
+    keyframes = Keyframes.of(views.textures, poses, sphere, drives, views.seen)
     offsets = []
     for row in _spaced(views.path_m, poses[:, 2], drives):
         distance = np.hypot(*(poses[:, :2] - poses[row, :2]).T)

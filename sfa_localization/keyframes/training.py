@@ -9,13 +9,14 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, Indices
+from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.data.statistics import evenly
 from sfa_localization.keyframes.closures import STRETCH_M
+from sfa_localization.keyframes.hidden import correlated_part
 from sfa_localization.keyframes.keyframes import FEWEST, Keyframes
 from sfa_localization.keyframes.regression import BORDER, Fit
-from sfa_localization.keyframes.texture import LIKE_A_PLACE
+from sfa_localization.keyframes.texture import LIKE_A_PLACE, columns_of
 
 LEAST, DENSITY = 2000, 2
 """Keyframes of a model, 3 kB each: so many, or in large places so many per square meter. A third of
@@ -30,7 +31,11 @@ _COMPARED, _FEWEST, _OF_LIGHT = 60, 20, 0.01
 
 
 def choose_keyframes(
-    textures: NDArray[np.int8], poses: Array, sphere: Sphere, drives: NDArray[np.int32]
+    textures: NDArray[np.int8],
+    poses: Array,
+    sphere: Sphere,
+    drives: NDArray[np.int32],
+    seen: Mask | None = None,
 ) -> tuple[Keyframes, Indices]:
     """Of textures (N, rows, columns) of training images, their poses (N, 3) in the map, and the
     numbers (N,) of their drives, choose some evenly over the ground: equally many per square meter,
@@ -44,7 +49,9 @@ def choose_keyframes(
     order = order[np.argsort(cell[order], kind='stable')]
     rank = np.arange(len(order)) - np.searchsorted(cell[order], cell[order])
     rows = np.sort(order[np.argsort(rank, kind='stable')[:number]])
-    keyframes = Keyframes.of(textures[rows], np.asarray(poses[rows], float), sphere, drives[rows])
+    keyframes = Keyframes.of(
+        textures[rows], np.asarray(poses[rows], float), sphere, drives[rows], seen
+    )
     return _by_light(keyframes), rows
 
 
@@ -74,7 +81,10 @@ def fit_among(keyframes: Keyframes, row: int, among: NDArray[np.bool_]) -> Fit |
     image, others = keyframes.spectrum(row), keyframes.take(among)
     if len(others.poses) < FEWEST:
         return None
-    scores, yaws = others.correlated(image)
+    part = image
+    if keyframes.seen is not None:  # what was filled in is of the others
+        part = correlated_part(columns_of(image, keyframes.columns), keyframes.seen)
+    scores, yaws = others.correlated(part)
     best = int(scores.argmax())
     if scores[best] < LIKE_A_PLACE:
         return None

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sfa_localization.camera.leveling import TILTED_RAD, leveled
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.run import Image
+from sfa_localization.keyframes.hidden import correlated_part, masked
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.texture import (
     LIKE_A_PLACE,
@@ -88,14 +89,13 @@ def _compared(
     level = leveled(panorama, tilt, keyframes.sphere) if tilt.any() else panorama
     image = texture(level)
     whole = part = spectrum(image)
-    if tilt.any():
+    if tilt.any() or keyframes.seen is not None:
         heights = [channel.stop - channel.start for channel in keyframes.channels]
         masks = [visible(tilt, n, keyframes.columns, keyframes.sphere) for n in heights]
         mask = np.concatenate(masks)
-        seen = image * mask
-        # Rows that were not seen would count as differences.
-        seen /= max(float(np.linalg.norm(seen)), 1e-6) * np.sqrt(mask.mean())
-        part = spectrum(seen)
+        if keyframes.seen is not None:
+            mask = mask & keyframes.seen
+        part = correlated_part(image, mask)
     if rows is None:
         order = np.argsort(-coarse_scores(part, keyframes.coarse), kind='stable')
         rows = np.sort(order[:_CANDIDATES])
@@ -110,5 +110,6 @@ def _leveled(keyframes: Keyframes, image: UprightImage) -> UprightImage:
     likest = likest[np.isfinite(image.scores[likest])]
     turn = -keyframes.sign * image.yaws[likest].astype(float)
     of_keyframes = keyframes.columns, keyframes.channels, keyframes.sphere
-    tilts, scores = find_tilt(image.spectrum, keyframes.aligned(likest), turn, *of_keyframes)
+    seen = image.spectrum if keyframes.seen is None else masked(image.spectrum, keyframes.seen)
+    tilts, scores = find_tilt(seen, keyframes.aligned(likest), turn, *of_keyframes)
     return without(keyframes, image, tilts[int(scores.argmax())])

@@ -461,7 +461,10 @@ TROUBLES = {
         lambda: body(0.2, top=0.5, plain=True), (1.0, 1.0), 'the lower [45].% of the view from 1'
     ),
     'mast behind, hidden': Trouble(
-        lambda: body(0.06), (0.08, 0.065), 'SFA, one', camera='blind_sectors: [165.0, 195.0]'
+        lambda: body(0.06), (0.065, 0.06), 'SFA, one', camera='blind_sectors: [165.0, 195.0]'
+    ),
+    'body behind, a quarter, hidden': Trouble(
+        lambda: body(0.25), (0.15, 0.1), 'SFA, one', camera='blind_sectors: [134.0, 226.0]'
     ),
     'camera askew, mount_rpy set': Trouble(
         lambda: mounted(5.0, 0.0, 30.0), (0.07, 0.055), 'SFA, one',

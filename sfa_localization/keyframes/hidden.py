@@ -1,0 +1,77 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Textures of a camera whose view the robot hides in part.
+
+What was not seen is missing, not different. An image is compared with keyframes only where it was
+seen. In a keyframe, the missing part is filled in from neighbors that saw it, because they faced
+another way: at each pixel, by the plane that fits their values over their places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sfa_localization.data.geometry import Array, Indices, Mask
+from sfa_localization.keyframes.texture import Spectra, Texture, columns_of, spectrum
+
+# Ridge of the slopes of a plane. From 0.02 to 0.2 images err alike; with less, planes extrapolate,
+# and without slopes an image errs by a tenth more.
+_RIDGE = 0.1
+_TINY = 1e-6
+
+
+def seen_by(repeated: Indices | None, channels: Sequence[slice], columns: int) -> Mask | None:
+    """Where textures, whose `channels` are rows, show what the camera sees: (rows, columns). In
+    panoramas, pixels (H, W) repeat those of `repeated`. None if all is seen.
+    """
+    if repeated is None:
+        return None
+    visible = repeated.ravel() == np.arange(repeated.size)
+    share = visible.reshape(repeated.shape).astype(np.float32)
+    sizes = [(columns, rows.stop - rows.start) for rows in channels]
+    parts = [cv2.resize(share, size, interpolation=cv2.INTER_AREA) for size in sizes]
+    return np.asarray(np.concatenate(parts) == 1)
+
+
+def turned_mask(seen: Mask, angle: float) -> Mask:
+    """The mask (rows, columns) of a texture that is `turned` by an angle, rad."""
+    columns = int(np.floor(-angle / (2 * np.pi) * seen.shape[1]))
+    return np.asarray(np.roll(seen, columns, axis=1) & np.roll(seen, columns + 1, axis=1))
+
+
+def masked(spectra: Spectra, seen: Mask) -> Spectra:
+    """Spectra (..., rows, F) of the part of textures in a mask (rows, columns)."""
+    return spectrum(columns_of(spectra, seen.shape[1]) * seen)
+
+
+def correlated_part(texture: Texture, seen: Mask) -> Spectra:
+    """The spectrum (rows, F) of the part of a texture in a mask (rows, columns), scaled so that its
+    correlations are those of the whole: what was not seen would count as different.
+    """
+    part = texture * seen
+    part /= max(float(np.linalg.norm(part)), _TINY) * np.sqrt(seen.mean())
+    return spectrum(part)
+
+
+def completed(spectra: Spectra, seen: Mask, places: Array, neighbors: int) -> Spectra:
+    """Spectra (K, rows, F) of textures at one heading, with their missing parts filled in from so
+    many neighbors, by masks (K, rows, columns) and places (K, 2) m. What no neighbor saw is 0.
+    """
+    textures = columns_of(spectra, seen.shape[2]) * seen
+    whole, nearest = textures.copy(), range(2, min(neighbors + 1, len(places)) + 1)
+    distance_m, near = cKDTree(places).query(places, nearest)
+    for row in np.flatnonzero(~seen.all(axis=(1, 2))).tolist():
+        missing, others = ~seen[row], near[row]
+        offset = (places[others] - places[row]) / max(float(distance_m[row].mean()), _TINY)
+        plane = np.column_stack([np.ones(len(others)), offset])
+        weight = np.exp(-(offset**2).sum(1) / 2)[:, None] * seen[others][:, missing]
+        squares = np.einsum('np,ni,nj->pij', weight, plane, plane)
+        ridge = np.outer(weight.sum(0), [0.0, _RIDGE, _RIDGE]) + _TINY
+        squares[:, range(3), range(3)] += ridge
+        values = np.einsum('np,ni->pi', weight * textures[others][:, missing], plane)
+        whole[row, missing] = np.linalg.solve(squares, values[..., None])[:, 0, 0]
+    return spectrum(whole)

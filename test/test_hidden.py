@@ -1,0 +1,141 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the robot hides of the view is missing in textures, and is filled in where others saw it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cylinder_worlds import Spheres, alone
+
+from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.keyframes.hidden import (
+    completed,
+    correlated_part,
+    masked,
+    seen_by,
+    turned_mask,
+)
+from sfa_localization.keyframes.keyframes import Keyframes
+from sfa_localization.keyframes.texture import (
+    channels,
+    columns_of,
+    correlate,
+    normalized,
+    quantized,
+    spectrum,
+    texture,
+    turned,
+)
+from sfa_localization.keyframes.training import choose_keyframes, fit_among
+
+CONFIG = PanoramaConfig(width=120, height=24)
+SECTOR = 150.0, 210.0
+WORLD = Spheres.about(0)
+
+
+def hidden(config=CONFIG):
+    """The pixel that each repeats, where the robot hides the view behind it."""
+    return Unwrapper(CameraConfig(blind_sectors=SECTOR), config).repeated
+
+
+def pictures(poses, config=CONFIG):
+    """Textures of what is not hidden, and the images (N, H, W, 3)."""
+    images = np.clip(WORLD.panoramas(poses, config), 0, 255).astype(np.uint8)
+    pixels = images.reshape(len(images), -1, 3)[:, hidden(config).ravel()]
+    images = pixels.reshape(images.shape)
+    return quantized(np.stack([texture(image) for image in images])), images
+
+
+def mask(rows, columns=80, config=CONFIG):
+    return seen_by(hidden(config), channels(rows), columns)
+
+
+def lanes(step=0.25):
+    """Poses (N, 3) of a square of 4 m, each lane headed another way."""
+    along = np.arange(-2.0, 2.01, step)
+    rows = enumerate(along.tolist())
+    return np.array([(x * (-1) ** n, y, np.pi * (n % 2)) for n, y in rows for x in along])
+
+
+def learnt(sees_all: bool, config=CONFIG) -> Keyframes:
+    poses = lanes()
+    textures, _ = pictures(poses, config)
+    seen = None if sees_all else mask(textures.shape[1], textures.shape[2], config)
+    drives = np.zeros(len(poses), np.int32)
+    return choose_keyframes(textures, poses, config.sphere, drives, seen)[0]
+
+
+def errors(keyframes, config=CONFIG):
+    """Mean errors, m and rad, at unseen poses."""
+    rng = np.random.default_rng(3)
+    poses = rng.uniform([-1.8, -1.8, -np.pi], [1.8, 1.8, np.pi], (60, 3))
+    places = np.array([alone(keyframes, image).pose for image in pictures(poses, config)[1]])
+    off = places - poses
+    return np.hypot(*off[:, :2].T).mean(), np.abs(wrap_angle(off[:, 2])).mean()
+
+
+@pytest.mark.parametrize('config', [CONFIG, replace(CONFIG, clockwise=False)])
+def test_images_with_a_hidden_sector_are_located_by_what_was_seen(config):
+    far, turned_by = errors(learnt(sees_all=False, config=config), config)
+    unaware, _ = errors(learnt(sees_all=True, config=config), config)
+    assert far < 0.03 and far < 0.3 * unaware
+    assert turned_by < np.deg2rad(0.3)
+
+
+def test_the_mask_is_that_of_the_sector_in_all_channels():
+    seen = mask(32)
+    assert seen.shape == (32, 80) and (seen == seen[0]).all()
+    assert seen[0].sum() == pytest.approx(80 * 300 / 360, abs=2)
+    assert seen_by(None, channels(32), 80) is None
+
+
+@pytest.mark.parametrize('angle', [-2.0, 0.0, 0.3, 3.1])
+def test_a_mask_turns_like_the_texture_and_hides_what_is_hidden_in_part(angle):
+    seen = mask(32)
+    shown = columns_of(turned(spectrum(seen.astype(np.float32)), angle), 80)
+    moved = turned_mask(seen, angle)
+    assert (shown[moved] > 0.8).all() and (~moved).sum() <= (~seen).sum() + 32
+
+
+def test_the_seen_part_correlates_like_the_whole_whatever_is_in_the_hidden_part():
+    rng = np.random.default_rng(0)
+    whole, seen = normalized(rng.normal(size=(8, 40)).astype(np.float32)), np.ones((8, 40), bool)
+    seen[:, :10] = False
+    changed = whole + ~seen * rng.normal(size=whole.shape).astype(np.float32)
+    (score,), (shift,) = correlate(correlated_part(changed, seen), spectrum(whole)[None], 40)
+    assert score == pytest.approx(1.0, abs=0.1) and abs(wrap_angle(shift * np.pi / 20)) < 0.01
+    np.testing.assert_allclose(
+        columns_of(masked(spectrum(changed), seen), 40), whole * seen, atol=1e-5
+    )
+
+
+def test_a_missing_part_is_filled_in_from_those_that_saw_it_and_is_0_where_nobody_did():
+    rng = np.random.default_rng(1)
+    places = rng.uniform(-1, 1, (60, 2))
+    base, slopes = rng.normal(size=(6, 20)), 0.1 * rng.normal(size=(2, 6, 20))
+    textures = (base + np.tensordot(places, slopes, 1)).astype(np.float32)
+    seen = rng.random((60, 1, 20)).repeat(6, axis=1) < 0.7
+    seen[:, :, 4] = False
+    filled = columns_of(completed(spectrum(textures), seen, places, 32), 20)
+    np.testing.assert_allclose(filled[seen], textures[seen], atol=1e-5)
+    assert np.abs(filled[:, :, 4]).max() < 1e-5
+    others = ~seen & (np.arange(20) != 4)
+    assert np.abs(filled - textures)[others].mean() < 0.1 * np.abs(textures)[others].mean()
+
+
+def test_a_keyframe_that_is_left_out_does_not_see_what_others_filled_in():
+    keyframes = learnt(sees_all=False)
+    row, among = 60, np.arange(len(keyframes.poses)) != 60
+    before = fit_among(keyframes, row, among)
+    values = keyframes.values.copy()
+    noisy = columns_of(keyframes.spectrum(row), keyframes.columns)
+    noisy = noisy + ~keyframes.seen * np.random.default_rng(0).normal(0, 0.02, noisy.shape)
+    aligned = turned(spectrum(noisy.astype(np.float32)), keyframes.sign * keyframes.poses[row, 2])
+    parts = np.ascontiguousarray(aligned.T).view(np.float32) / keyframes.step
+    values[row] = np.rint(parts).clip(-127, 127)
+    after = fit_among(replace(keyframes, values=values), row, among)
+    np.testing.assert_allclose(after.place, before.place, atol=0.01)
+    assert after.yaw == pytest.approx(before.yaw, abs=0.01)
