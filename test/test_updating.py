@@ -125,7 +125,7 @@ def test_network_maps_and_first_keyframes_stay_also_in_its_file(tmp_path):
 def test_familiar_images_are_not_new():
     """The same drive a second time."""
     _, new, newer = updated()
-    assert len(new_views(newer, drive())) < 0.2 * len(new)
+    assert len(new_views(newer, drive())) < 0.5 * len(new)
 
 
 def test_a_place_that_was_never_trained_is_refused_with_the_remedy():
