@@ -12,12 +12,10 @@ from typing import Any
 from sfa_localization.bags.drives import ReadingRecipe
 from sfa_localization.camera import body
 from sfa_localization.camera.kinds import require_single_view
-from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings, turns_and_textures
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
-from sfa_localization.data.geometry import Mask
 from sfa_localization.data.progress import announce, progress_bar
 from sfa_localization.data.run import Run
 from sfa_localization.data.sphere import Sphere
@@ -25,7 +23,7 @@ from sfa_localization.data.statistics import evenly
 from sfa_localization.fusion.camera_clock import camera_clock
 from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.keyframes.closures import Textures, find_closures, views_of
-from sfa_localization.keyframes.hidden import seen_by
+from sfa_localization.keyframes.hidden import seen_in
 from sfa_localization.keyframes.leveling import leveled_runs
 from sfa_localization.keyframes.texture import channels
 from sfa_localization.metric.dead_reckoning import OdometryTrack
@@ -79,7 +77,8 @@ class TrainingInput:
             runs = leveled_runs(runs, recipe.panorama.sphere, bar.update)
         with progress_bar(titled(2, 'find loop closures'), total, visible=progress) as bar:
             views = views_of(runs, bar.update)
-        views = replace(views, seen=_seen(views, runs[0], recipe))
+        if runs[0].seen is not None:
+            views = replace(views, seen=seen_in(runs[0].seen, *views.textures.shape[1:]))
         _warn_of_bodies(runs, views, recipe.panorama.sphere)
         closures = find_closures(views, recipe.panorama.clockwise)
         runs = same_scale(runs, closures)
@@ -190,14 +189,6 @@ def _compared(run: Run, recipe: Recipe, force: bool) -> tuple[Run, MotionCheck]:
 def _warn(run: Run, texts: Sequence[str]) -> None:
     for text in texts:
         logger.warning('%s: %s', run.name, text)
-
-
-def _seen(views: Textures, run: Run, recipe: Recipe) -> Mask | None:
-    """Where textures of a run show what the camera sees; None if all of it is seen."""
-    height, width, _ = run.panoramas.shape
-    panorama = replace(recipe.panorama, height=height, width=width)
-    _, rows, columns = views.textures.shape
-    return seen_by(Unwrapper(recipe.camera, panorama).repeated, channels(rows), columns)
 
 
 def _warn_of_bodies(runs: Sequence[Run], views: Textures, sphere: Sphere) -> None:

@@ -15,12 +15,11 @@ from sfa_localization.keyframes.hidden import (
     completed,
     correlated_part,
     masked,
-    seen_by,
+    seen_in,
     turned_mask,
 )
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.texture import (
-    channels,
     columns_of,
     correlate,
     normalized,
@@ -36,21 +35,20 @@ SECTOR = 150.0, 210.0
 WORLD = Spheres.about(0)
 
 
-def hidden(config=CONFIG):
-    """The pixel that each repeats, where the robot hides the view behind it."""
-    return Unwrapper(CameraConfig(blind_sectors=SECTOR), config).repeated
+def camera(config=CONFIG):
+    return Unwrapper(CameraConfig(blind_sectors=SECTOR), config)
 
 
 def pictures(poses, config=CONFIG):
     """Textures of what is not hidden, and the images (N, H, W, 3)."""
     images = np.clip(WORLD.panoramas(poses, config), 0, 255).astype(np.uint8)
-    pixels = images.reshape(len(images), -1, 3)[:, hidden(config).ravel()]
+    pixels = images.reshape(len(images), -1, 3)[:, camera(config).repeated.ravel()]
     images = pixels.reshape(images.shape)
     return quantized(np.stack([texture(image) for image in images])), images
 
 
 def mask(rows, columns=80, config=CONFIG):
-    return seen_by(hidden(config), channels(rows), columns)
+    return seen_in(camera(config).seen((config.height, config.width)), rows, columns)
 
 
 def lanes(step=0.25):
@@ -89,7 +87,6 @@ def test_the_mask_is_that_of_the_sector_in_all_channels():
     seen = mask(32)
     assert seen.shape == (32, 80) and (seen == seen[0]).all()
     assert seen[0].sum() == pytest.approx(80 * 300 / 360, abs=2)
-    assert seen_by(None, channels(32), 80) is None
 
 
 @pytest.mark.parametrize('angle', [-2.0, 0.0, 0.3, 3.1])

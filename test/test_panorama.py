@@ -139,6 +139,7 @@ def test_a_mask_picture_of_any_size_hides_what_is_black_of_images_of_any_size(tm
         seen = unwrapper.visible(size)
         assert not seen[:, 46:134].any()
         assert seen[:, :44].all() and seen[:, 136:].all()
+        np.testing.assert_array_equal(unwrapper.seen(size), seen)
         result = unwrapper(picture_of(smooth, size=size))
         assert psnr(result[seen], direct(smooth, SMALL)[seen]) > 35
 
@@ -147,6 +148,7 @@ def test_what_the_camera_does_not_see_is_filled_from_what_it_sees():
     lens = LensCalibration(cx=200.0)
     unwrapper = Unwrapper(CameraConfig(), SMALL, lens)
     result = unwrapper(picture_of(lambda rays: 0 * rays + 200, lens))
+    assert unwrapper.seen(SIZE) is None, 'nothing hides the view'
     assert 0.5 < unwrapper.visible(SIZE).mean() < 0.95
     assert (result == 200).all()
     panorama = PanoramaConfig(width=90, height=40, elevation_min=-10.0, elevation_max=60.0)
@@ -225,6 +227,7 @@ def test_recorded_panoramas_are_mounted_and_masked_in_their_size(tmp_path):
                 bag.message('/front/panorama/info', 10**18, info)
         run = read_drive(tmp_path / name, tmp_path, ReadingRecipe(camera=camera))
         np.testing.assert_array_equal(run.panoramas.read(0, 1)[0], expected)
+        assert 40 <= (~run.seen[0]).sum() <= 41 and (run.seen == run.seen[0]).all()
         missing = ReadingRecipe(camera=CameraConfig(mask_file='nowhere.png'))
         learned = as_live(ReadingRecipe(), PanoramaConfig(), camera.mount_rpy)
         assert learned.camera.mount_rpy == camera.mount_rpy

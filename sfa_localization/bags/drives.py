@@ -28,6 +28,7 @@ from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.camera.watch import FrozenWatch, frozen
 from sfa_localization.data.errors import BagError, DataError, MessageError, ModelError
 from sfa_localization.data.files import replaced_mode
+from sfa_localization.data.geometry import Mask
 from sfa_localization.data.messages import read_tilt, read_yaw_rate
 from sfa_localization.data.progress import progress_bar
 from sfa_localization.data.run import Image, Origin, PanoramaArray, Panoramas, Points, Run, Stamps
@@ -155,9 +156,8 @@ def read_drive(
             covered = odometry.trajectory.covers(stamps_ns, int(recipe.odometry_tolerance_s * 1e9))
             _require_covered(streams['images'], covered, recipe.odometry_tolerance_s)
             panoramas: Panoramas = stored.finish(stamps_ns, covered)
-            if recipe.camera.level_by_imu:
-                imu, tilts = streams['orientation'], values['orientation']
-                panoramas = _leveled(panoramas, imu, tilts, recipe.panorama.sphere)
+            if imu := streams.get('orientation'):
+                panoramas = _leveled(panoramas, imu, values['orientation'], recipe.panorama.sphere)
         except OSError as error:
             raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
         origin, points = _measured(bag, streams, values, recipe.origin)
@@ -167,7 +167,8 @@ def read_drive(
     counts = {use: stream.count for use, stream in streams.items()}
     yaw_rate = to_yaw_rate(values['imu']) if values.get('imu') else None
     truth = to_trajectory(values['ground_truth']) if values.get('ground_truth') else None
-    return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, points, counts, camera, origin)
+    seen, motion = stored.seen, (odometry, yaw_rate, truth)
+    return Run(bag.path.name, panoramas, *motion, points, counts, camera, origin, seen)
 
 
 def _measured(
@@ -207,6 +208,12 @@ class _PanoramaFile:
         self.stamps: list[int] = []
         self.repeats = 0
         self._shape: tuple[int, ...] = ()
+        self._size = 0, 0
+
+    @property
+    def seen(self) -> Mask | None:
+        """The pixels (H, W) that the camera sees, if any are hidden."""
+        return self._unwrap.seen(self._size)
 
     def panorama(self, image: Image) -> Image:
         """The panorama of a camera's image. Raises LocalizationError."""
@@ -216,6 +223,7 @@ class _PanoramaFile:
             elif image.shape != self._shape:
                 height, width = self._shape[:2]
                 raise MessageError(f'size is not {width}x{height} like the first image')
+        self._size = image.shape[0], image.shape[1]
         image = self._unwrap(image)
         if self._watch is not None and not self._watch.add(image):
             self.repeats += 1

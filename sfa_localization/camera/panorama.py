@@ -102,6 +102,13 @@ class Unwrapper:
         """Mask (H, W) of the panorama pixels visible in images of `size` (rows, columns)."""
         return self._tables_of(size).visible
 
+    def seen(self, size: tuple[int, int]) -> Mask | None:
+        """Mask (H, W) of the panorama pixels that images of `size` (rows, columns) show; None where
+        neither a mask nor a sector hides any.
+        """
+        tables = self._tables_of(size)
+        return None if tables.repeated is None else tables.visible
+
     def check(self, size: tuple[int, int] | None = None) -> None:
         """Raise CameraError for a lens, mount, mask or sector that cannot be used for images of
         `size` (rows, columns), by default of that of the calibration, or panoramas.

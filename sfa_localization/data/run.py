@@ -12,7 +12,7 @@ from typing import IO, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, Indices, compose, relative, wrap_angle
+from sfa_localization.data.geometry import Array, Indices, Mask, compose, relative, wrap_angle
 
 Stamps = NDArray[np.int64]
 Image = NDArray[np.uint8]
@@ -208,7 +208,8 @@ class Run:
 
     `counts` holds the used and skipped messages per stream ('images', 'odometry', ...); `camera`
     is the lever arm of the camera, ahead + i left of base_link, m, if the bag contains it. Places
-    of a satellite receiver count from the `origin`.
+    of a satellite receiver count from the `origin`. Where the robot hides its view, panoramas show
+    what is `seen` (H, W).
     """
 
     name: str
@@ -220,6 +221,7 @@ class Run:
     counts: dict[str, Count] = field(default_factory=dict)
     camera: complex | None = None
     origin: Origin | None = None
+    seen: Mask | None = None
 
 
 def integrate(stamps_ns: Stamps, twists: Array, start: Array | None = None) -> Array:

@@ -9,14 +9,12 @@ another way: at each pixel, by the plane that fits their values over their place
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfa_localization.data.geometry import Array, Indices, Mask
-from sfa_localization.keyframes.texture import Spectra, Texture, columns_of, spectrum
+from sfa_localization.data.geometry import Array, Mask
+from sfa_localization.keyframes.texture import Spectra, Texture, channels, columns_of, spectrum
 
 # Ridge of the slopes of a plane. From 0.02 to 0.2 images err alike; with less, planes extrapolate,
 # and without slopes an image errs by a tenth more.
@@ -24,15 +22,10 @@ _RIDGE = 0.1
 _TINY = 1e-6
 
 
-def seen_by(repeated: Indices | None, channels: Sequence[slice], columns: int) -> Mask | None:
-    """Where textures, whose `channels` are rows, show what the camera sees: (rows, columns). In
-    panoramas, pixels (H, W) repeat those of `repeated`. None if all is seen.
-    """
-    if repeated is None:
-        return None
-    visible = repeated.ravel() == np.arange(repeated.size)
-    share = visible.reshape(repeated.shape).astype(np.float32)
-    sizes = [(columns, rows.stop - rows.start) for rows in channels]
+def seen_in(panorama: Mask, rows: int, columns: int) -> Mask:
+    """Which pixels of textures (rows, columns) show only pixels (H, W) seen in the panorama."""
+    share = panorama.astype(np.float32)
+    sizes = [(columns, part.stop - part.start) for part in channels(rows)]
     parts = [cv2.resize(share, size, interpolation=cv2.INTER_AREA) for size in sizes]
     return np.asarray(np.concatenate(parts) == 1)
 
