@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from sfa_localization.bags.drives import ReadingRecipe
 from sfa_localization.camera import body
 from sfa_localization.camera.kinds import require_single_view
@@ -77,8 +79,9 @@ class TrainingInput:
             runs = leveled_runs(runs, recipe.panorama.sphere, bar.update)
         with progress_bar(titled(2, 'find loop closures'), total, visible=progress) as bar:
             views = views_of(runs, bar.update)
-        if runs[0].seen is not None:
-            views = replace(views, seen=seen_in(runs[0].seen, *views.textures.shape[1:]))
+        if masks := [run.seen for run in runs if run.seen is not None]:
+            seen = np.logical_and.reduce(masks)
+            views = replace(views, seen=seen_in(seen, *views.textures.shape[1:]))
         _warn_of_bodies(runs, views, recipe.panorama.sphere)
         closures = find_closures(views, recipe.panorama.clockwise)
         runs = same_scale(runs, closures)

@@ -223,8 +223,8 @@ class _PanoramaFile:
             elif image.shape != self._shape:
                 height, width = self._shape[:2]
                 raise MessageError(f'size is not {width}x{height} like the first image')
-        self._size = image.shape[0], image.shape[1]
-        image = self._unwrap(image)
+        size = image.shape[0], image.shape[1]
+        image, self._size = self._unwrap(image), size
         if self._watch is not None and not self._watch.add(image):
             self.repeats += 1
             raise MessageError('image repeats the one before')

@@ -200,15 +200,15 @@ def encoded(
     of `others`, or the one with which the largest value is 127: one thousandth of their squares is
     lost. What textures have not `seen` (rows, columns) is filled in from all these keyframes.
     """
-    angles = poses[:, 2] * (1 if sphere.clockwise else -1)
-    spectra, places = turned(spectra_of(textures), angles), poses[:, :2]
+    sign = 1 if sphere.clockwise else -1
+    spectra = turned(spectra_of(textures), sign * poses[:, 2])
     if seen is not None:
-        masks = np.stack([turned_mask(seen, angle) for angle in angles.tolist()])
+        known, at = spectra, poses
         if others is not None:
-            spectra = np.concatenate([spectra, others.aligned(slice(None))])
-            places = np.concatenate([places, others.poses[:, :2]])
-            masks = np.concatenate([masks, np.ones((len(others.poses), *seen.shape), bool)])
-        spectra = completed(spectra, masks, places, NEIGHBORS)[: len(poses)]
+            known = np.concatenate([spectra, others.aligned(slice(None))])
+            at = np.concatenate([poses, others.poses])
+        masks = np.stack([turned_mask(seen, sign * yaw) for yaw in at[:, 2].tolist()])
+        spectra = completed(known, masks, at[:, :2])[: len(poses)]
     parts = spectra.swapaxes(1, 2).copy().view(np.float32)
-    step = others.step if others else max(float(np.abs(parts).max()) / 127, 1e-9)
+    step = others.step if others is not None else max(float(np.abs(parts).max()) / 127, 1e-9)
     return np.rint(parts / step).clip(-127, 127).astype(np.int8), step
