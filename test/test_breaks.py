@@ -148,7 +148,7 @@ def test_a_heading_beside_the_way_is_turned_to_it(degrees, speed):
     assert np.abs(np.angle(error)).max() < np.radians(0.1)
 
 
-def test_a_drive_whose_wheels_count_more_is_learned_with_the_scale_of_the_first():
+def test_drives_whose_wheels_count_differently_are_learned_with_the_median_scale():
     wheels = odometry(np.full(len(STAMPS), 1.0), 0.3)
     images = PanoramaArray(IMAGES, np.zeros((len(IMAGES), 1, 1, 3), np.uint8))
     poses, twists = wheels.poses * [1.08, 1.08, 1.0], wheels.twists * [1.08, 1.0]
@@ -156,9 +156,15 @@ def test_a_drive_whose_wheels_count_more_is_learned_with_the_scale_of_the_first(
     larger = replace(run, odometry=replace(wheels, poses=poses, twists=twists))
     rows, count = np.arange(0, len(IMAGES), 2), len(IMAGES)
     near = np.clip(rows + np.random.default_rng(0).integers(-1, 2, len(rows)), 0, count - 1)
-    closures = Closures(np.column_stack([rows, count + near]), np.zeros(len(rows)))
-    first, second = same_scale([run, larger], closures)
-    assert first is run
+    pairs = np.column_stack([rows, count + near]), np.column_stack([rows, 2 * count + near])
+    closures = Closures(np.concatenate(pairs), np.zeros(2 * len(rows)))
+    first, second, third = same_scale([run, larger, run], closures)
+    assert first is run and third is run
     np.testing.assert_allclose(second.odometry.poses, wheels.poses, atol=0.05)
     np.testing.assert_allclose(second.odometry.twists, wheels.twists, rtol=0.01)
+    for pair in ([run, larger], [larger, run]):
+        for drive in same_scale(pair, closures):
+            np.testing.assert_allclose(drive.odometry.twists[:, 0], np.sqrt(1.08), rtol=0.01)
     assert same_scale([run, run], closures)[1].odometry is wheels
+    alone = Closures(pairs[0][:5], np.zeros(5))
+    assert same_scale([run, larger], alone)[1] is larger

@@ -167,34 +167,40 @@ def _fitted(moved: Complex, by_odometry: Complex, by_loss: Complex) -> Way:
 
 
 def same_scale(runs: Sequence[Run], closures: Closures) -> tuple[Run, ...]:
-    """Drives with the scale of the first one's wheels: where two drives pass the same places,
-    closures show which of them counts more way between these.
+    """Drives with the median scale of their wheels: where two drives pass the same places, closures
+    show which of them counts more way between these. A drive without such places stays as it is.
     """
-    counts = np.array([len(run.panoramas) for run in runs])
-    even = [runs[0]]
+    counts, logs = np.array([len(run.panoramas) for run in runs]), [0.0]
     for number, run in enumerate(runs[1:], 1):
         images = closures.images - [0, counts[:number].sum()]
         images = images[((images >= 0) & (images < counts[[0, number]])).all(axis=1)]
-        even.append(_rescaled(runs[0], run, images) if len(images) >= CLOSURES_MIN else run)
-    return tuple(even)
+        logs.append(_log_ratio(runs[0], run, images) if len(images) >= CLOSURES_MIN else np.nan)
+    factors = np.exp(np.nan_to_num(np.array(logs) - np.nanmedian(logs)))
+    return tuple(map(_rescaled, runs, factors.tolist()))
 
 
-def _rescaled(first: Run, run: Run, images: Indices) -> Run:
-    """A drive with the scale of a first one, by images (L, 2) of both at the same places."""
+def _log_ratio(first: Run, run: Run, images: Indices) -> float:
+    """The logarithm of how much more way the wheels of a drive count than those of a first one, by
+    images (L, 2) of both at the same places; 0 if that is not clear.
+    """
     pairs = images[evenly(len(images), _PAIRED)].T
     (by_first, near), (distance, also_near) = _distances(first, pairs[0]), _distances(run, pairs[1])
     usable = np.triu(near & also_near)
     if not usable.any():
-        return run
+        return 0.0
     ratio = np.log(distance[usable] / by_first[usable])
     middle = float(np.median(ratio))
     # Pairs share their closures: only these are independent.
     std = MEDIAN_TO_STD * float(np.median(np.abs(ratio - middle))) / np.sqrt(pairs.shape[1])
-    if abs(middle) < max(UNEQUAL, CHANCE_STDS * std):
+    return middle if abs(middle) >= max(UNEQUAL, CHANCE_STDS * std) else 0.0
+
+
+def _rescaled(run: Run, factor: float) -> Run:
+    """A drive whose wheels count so many times the way of the median drive."""
+    if factor == 1.0:
         return run
-    factor = float(np.exp(middle))
-    text = '%s: its wheels count %.3g times the way of those of %s: taken into account'
-    logger.warning(text, run.name, factor, first.name)
+    text = '%s: its wheels count %.3g times the way of the median drive: taken into account'
+    logger.warning(text, run.name, factor)
     odometry, scale = run.odometry, np.array([factor, factor, 1.0])
     poses, twists = odometry.poses / scale, odometry.twists / scale[1:]
     return replace(run, odometry=replace(odometry, poses=poses, twists=twists))
