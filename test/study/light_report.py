@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from page_tables import markdown
 
 from study.paper_report import gardens, number
@@ -27,21 +28,30 @@ MEASURES = {
 
 
 def table(cells: Cells) -> str:
-    """A line for each condition as Markdown: the scores in the first garden, and the range of the
-    filter's errors in all gardens `world`.
+    """A line for each condition as Markdown: the mean scores of all gardens `world`, and the range
+    of the filter's errors in them.
     """
-    rows, first = [], min(cell.get('world', 0) for cell in cells)
+    rows = []
     for name in dict.fromkeys(map(condition, cells)):
-        same = [cell for cell in cells if condition(cell) == name]
-        errors = [e for cell in same if (e := value_of(cell, 'ekf', 'mean_m')) is not None]
+        means = [number(mean_of(cells, name, *path)) for path in MEASURES.values()]
+        inside = mean_of(cells, name, 'ekf', 'within_95')
+        errors = values_of(cells, name, 'ekf', 'mean_m')
         extent = f'{min(errors):.3f}-{max(errors):.3f}' if errors else '-'
-        for cell in same:
-            if cell.get('world', 0) == first:
-                values = (number(value_of(cell, *path)) for path in MEASURES.values())
-                inside = value_of(cell, 'ekf', 'within_95')
-                rows.append([name, *values, '-' if inside is None else f'{inside:.0%}', extent])
-    worlds = gardens(len({cell.get('world') for cell in cells}))
+        rows.append([name, *means, '-' if inside is None else f'{inside:.0%}', extent])
+    worlds = gardens(len({cell['world'] for cell in cells}))
     return markdown(['tested in', *MEASURES, 'inside:', f'EKF in {worlds} (m):'], rows)
+
+
+def mean_of(cells: Cells, name: str, *path: str) -> float | None:
+    """The mean score of all gardens in a condition; None where no cell has one."""
+    values = values_of(cells, name, *path)
+    return float(np.mean(values)) if values else None
+
+
+def values_of(cells: Cells, name: str, *path: str) -> list[float]:
+    """The scores in a condition."""
+    scores = (value_of(cell, *path) for cell in cells if condition(cell) == name)
+    return [score for score in scores if score is not None]
 
 
 def condition(cell: Mapping[str, Any]) -> str:

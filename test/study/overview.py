@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sfa_localization.reports.figures import save
-from study.light_report import condition, value_of
+from study.light_report import condition, mean_of, value_of
 from study.paper_report import PAPER, gardens, values_of
 from study.rig import ABOVE, CASES, SLOPES, UNEVEN
 
@@ -85,20 +85,20 @@ def paper(results: Mapping[str, Cells]) -> tuple[list[Panel], str]:
 def lights(results: Mapping[str, Cells]) -> tuple[list[Panel], str]:
     """Trained by day, tested in each light and season."""
     cells = results['light']
-    worlds = {cell['world'] for cell in cells}
-    here = [cell for cell in cells if cell['world'] == min(worlds)]
+    worlds = len({cell['world'] for cell in cells})
+    conditions = [*dict.fromkeys(map(condition, cells))]
     names = dict(zip(ESTIMATES, ('paper', 'slow', 'sfa', 'ekf'), strict=True))
     series = {
-        title: [_number(value_of(cell, name, 'mean_m')) for cell in here]
+        title: [_number(mean_of(cells, each, name, 'mean_m')) for each in conditions]
         for title, name in names.items()
     }
-    groups = [condition(cell).replace(', ', '\n') for cell in here]
+    groups = [each.replace(', ', '\n') for each in conditions]
     errors = [_number(value_of(cell, 'ekf', 'mean_m')) for cell in cells]
     wrong = sum(cell.get('false_localised_s', 0.0) for cell in cells)
     return [Panel('trained by day in summer', groups, series)], (
-        f'**Light and season**, rendered, {gardens(len(worlds))}: trained by day in summer, the '
-        f'filter errs by {np.nanmin(errors):.2f} to {np.nanmax(errors):.2f} m in all lights and '
-        f'seasons, and was LOCALISED and wrong for {wrong:.0f} s.'
+        f'**Light and season**, rendered, {gardens(worlds)}: trained by day in summer, the '
+        f'filter errs by {np.nanmin(errors):.2f} to {np.nanmax(errors):.2f} m in all gardens and '
+        f'lights, and was LOCALISED and wrong for {wrong:.0f} s.'
     )
 
 
