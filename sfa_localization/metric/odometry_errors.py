@@ -17,6 +17,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -168,31 +169,46 @@ def _fitted(moved: Complex, by_odometry: Complex, by_loss: Complex) -> Way:
 
 def same_scale(runs: Sequence[Run], closures: Closures) -> tuple[Run, ...]:
     """Drives with the median scale of their wheels: where two drives pass the same places, closures
-    show which of them counts more way between these. A drive without such places stays as it is.
+    show which of them counts more way between these. The scales are those of least squares of all
+    pairs; they are used if two drives differ clearly.
     """
-    counts, logs = np.array([len(run.panoramas) for run in runs]), [0.0]
-    for number, run in enumerate(runs[1:], 1):
-        images = closures.images - [0, counts[:number].sum()]
-        images = images[((images >= 0) & (images < counts[[0, number]])).all(axis=1)]
-        logs.append(_log_ratio(runs[0], run, images) if len(images) >= CLOSURES_MIN else np.nan)
-    factors = np.exp(np.nan_to_num(np.array(logs) - np.nanmedian(logs)))
-    return tuple(map(_rescaled, runs, factors.tolist()))
+    starts = np.cumsum([0, *(len(run.panoramas) for run in runs)])
+    owner = np.searchsorted(starts, closures.images, 'right') - 1
+    pairs, ratios, is_clear = [], [], False
+    for first, second in combinations(range(len(runs)), 2):
+        images = closures.images[(owner == [first, second]).all(axis=1)] - starts[[first, second]]
+        ratio, std = _log_ratio(runs[first], runs[second], images)
+        if np.isfinite(std):
+            pairs.append(np.eye(len(runs))[second] - np.eye(len(runs))[first])
+            ratios.append(ratio)
+            is_clear |= abs(ratio) >= max(UNEQUAL, CHANCE_STDS * std)
+    if not is_clear:
+        return tuple(runs)
+    scales = np.linalg.lstsq(np.array(pairs), np.array(ratios), rcond=None)[0]
+    scales -= np.median(scales)
+    scales[np.abs(scales) < UNEQUAL / 2] = 0.0
+    return tuple(map(_rescaled, runs, np.exp(scales).tolist()))
 
 
-def _log_ratio(first: Run, run: Run, images: Indices) -> float:
-    """The logarithm of how much more way the wheels of a drive count than those of a first one, by
-    images (L, 2) of both at the same places; 0 if that is not clear.
+def _log_ratio(first: Run, second: Run, images: Indices) -> tuple[float, float]:
+    """The logarithm of how much more way the wheels of a second drive count than those of a first
+    one, by images (L, 2) of both at the same places, and its standard deviation; infinite for too
+    few.
     """
     pairs = images[evenly(len(images), _PAIRED)].T
-    (by_first, near), (distance, also_near) = _distances(first, pairs[0]), _distances(run, pairs[1])
+    (by_first, near), (distance, also_near) = (
+        _distances(first, pairs[0]),
+        _distances(second, pairs[1]),
+    )
     usable = np.triu(near & also_near)
-    if not usable.any():
-        return 0.0
+    if len(images) < CLOSURES_MIN or not usable.any():
+        return 0.0, np.inf
     ratio = np.log(distance[usable] / by_first[usable])
     middle = float(np.median(ratio))
     # Pairs share their closures: only these are independent.
-    std = MEDIAN_TO_STD * float(np.median(np.abs(ratio - middle))) / np.sqrt(pairs.shape[1])
-    return middle if abs(middle) >= max(UNEQUAL, CHANCE_STDS * std) else 0.0
+    return middle, MEDIAN_TO_STD * float(np.median(np.abs(ratio - middle))) / np.sqrt(
+        pairs.shape[1]
+    )
 
 
 def _rescaled(run: Run, factor: float) -> Run:
