@@ -378,7 +378,7 @@ def mounted(roll, pitch, yaw):
 
 
 RIGHT_M = 0.055, 0.055
-"""One image and filter of the untouched drive err by 0.042 m: a trouble that is mended adds a
+"""One image and filter of the untouched drive err by 0.041 m: a trouble that is mended adds a
 little."""
 TROUBLES = {
     'truth: 5 % zeros': Trouble(

@@ -73,7 +73,8 @@ def table(cells: Sequence[Cell]) -> str:
     for name in CASES:
         same = [c for c in cells if c['case'] == name and c['slope'] == 0.0]
         if same and name != UNEVEN:
-            rows.append([name, *(form.format(_mean(same, n)) for n, form in FORMS.items())])
+            texts = (form.format(_mean(same, n)) for n, form in FORMS.items())
+            rows.append([name, *(text.replace('-0.00', '0.00') for text in texts)])
     head = [
         'camera',
         'place by the training (m):',
