@@ -195,20 +195,16 @@ def _log_ratio(first: Run, second: Run, images: Indices) -> tuple[float, float]:
     one, by images (L, 2) of both at the same places, and its standard deviation; infinite for too
     few.
     """
-    pairs = images[evenly(len(images), _PAIRED)].T
-    (by_first, near), (distance, also_near) = (
-        _distances(first, pairs[0]),
-        _distances(second, pairs[1]),
-    )
+    images = images[evenly(len(images), _PAIRED)]
+    by_first, near = _distances(first, images[:, 0])
+    by_second, also_near = _distances(second, images[:, 1])
     usable = np.triu(near & also_near)
     if len(images) < CLOSURES_MIN or not usable.any():
         return 0.0, np.inf
-    ratio = np.log(distance[usable] / by_first[usable])
+    ratio = np.log(by_second[usable] / by_first[usable])
     middle = float(np.median(ratio))
-    # Pairs share their closures: only these are independent.
-    return middle, MEDIAN_TO_STD * float(np.median(np.abs(ratio - middle))) / np.sqrt(
-        pairs.shape[1]
-    )
+    std = MEDIAN_TO_STD * float(np.median(np.abs(ratio - middle)))
+    return middle, std / np.sqrt(len(images))  # pairs share images: only these are independent
 
 
 def _rescaled(run: Run, factor: float) -> Run:
