@@ -78,7 +78,8 @@ def paper(results: Mapping[str, Cells]) -> tuple[list[Panel], str]:
     return panels, (
         f"**The paper's experiments**, rendered, {count}: one image errs "
         f'by {image[0]:.2f} and {image[1]:.2f} m; in the robot experiment the filter errs by '
-        f'{-gain:.0f} % less than the wheels, that of the paper by {of_paper:.0%}.'
+        f'{-gain:.0f} % less than the wheels, that of the paper, in its own garden, by '
+        f'{of_paper:.0%}.'
     )
 
 
@@ -98,7 +99,7 @@ def lights(results: Mapping[str, Cells]) -> tuple[list[Panel], str]:
     return [Panel('trained by day in summer', groups, series)], (
         f'**Light and season**, rendered, {gardens(worlds)}: trained by day in summer, the '
         f'filter errs by {np.nanmin(errors):.2f} to {np.nanmax(errors):.2f} m in all gardens and '
-        f'lights, and was LOCALISED and wrong for {wrong:.0f} s.'
+        f'lights, and was LOCALISED and wrong by more than 1 m for {wrong:.0f} s.'
     )
 
 
@@ -113,7 +114,7 @@ def ground(results: Mapping[str, Cells]) -> tuple[list[Panel], str]:
     image, ekf = series['one image'], series['EKF']
     return [Panel('standard deviation of the slope', groups, series)], (
         f'**Uneven ground**, rendered, {_gardens(results)}: trained on flat ground, one image errs '
-        f'by {image[0]:.2f} m there and by {max(image):.2f} m on slopes, the filter by '
+        f'by {image[0]:.2f} m there and by {max(image):.2f} m on slopes of up to 4°, the filter by '
         f'{ekf[0]:.2f} and {max(ekf):.2f} m.'
     )
 
