@@ -57,8 +57,7 @@ def learn_keyframes(
     counts as `turn_radius_m` per rad. Raises DataError for too few images."""
     _, seen, row = np.intersect1d(views.images, result.images, return_indices=True)
     poses, drives = result.poses[row], views.run[seen].astype(np.int32)
-    textures = views.textures[seen]
-    keyframes, kept = choose_keyframes(textures, poses, sphere, drives, views.seen)
+    keyframes, kept = choose_keyframes(views.textures[seen], poses, sphere, drives, views.seen)
     path, rows = _along_tracks(views, segments)[seen][kept], row[kept]
     tried, fits, near_m = located_without(keyframes, path)
     shared = {'map_m': result.map.common_m, 'turn_std': usual_turn_std(result.angle_covariance)}
