@@ -109,8 +109,10 @@ def test_results_come_onto_the_page_once_and_only_of_this_version(tmp_path, monk
     for name in ('README', 'PAGE', 'RECORD'):
         source = getattr(page, name)
         monkeypatch.setattr(page, name, shutil.copy(source, tmp_path / f'{name}{source.suffix}'))
-    shutil.copy(page.TESTS / 'README.md', tmp_path)
-    monkeypatch.setattr(page, 'TESTS', tmp_path)
+    tests = tmp_path / 'test'
+    tests.mkdir()
+    shutil.copy(page.TESTS / 'README.md', tests)
+    monkeypatch.setattr(page, 'TESTS', tests)
     monkeypatch.setattr(page, 'FIGURES', tmp_path)
     cell = {'log': 'a drive', 'plain': {'error_m': 0.0625, 'xy_within_95': 0.5}}
     cell['ours'] = {**cell['plain'], 'error_m': 0.03125}
