@@ -8,7 +8,6 @@ beside 50 odometry messages, and the CPU time and memory of a node until it is a
 
 from __future__ import annotations
 
-import itertools
 import json
 import sys
 import time
@@ -24,14 +23,16 @@ import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import Image
+from std_msgs.msg import String
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from bench_core import images_of
+from bench_core import images_and_poses
 from ros_bench import DEADLINE_S, DOMAIN, FRAMES, Spinner, start_process, until
 
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.nodes.conversions import to_image, to_odometry
+from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.place_model import PlaceModel
 
 ODOMETRY_HZ, IDLE_S = 50.0, 1.0
@@ -54,20 +55,21 @@ def end_process(process):
 
 
 class Driver:
-    """Sends panoramas (N, H, W, 3) and odometry to the nodes, and notes when the poses come."""
+    """Sends images and odometry to the nodes, and notes when the poses come."""
 
-    def __init__(self, panoramas: np.ndarray) -> None:
+    def __init__(self) -> None:
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=DOMAIN)
         self.node = rclpy.create_node('bench', context=self.context, namespace=NAMESPACE)
         self.executor = Spinner(self.context)
         self.executor.add_node(self.node)
-        self.panoramas = itertools.cycle(panoramas.copy())
-        self.sent: dict[int, float] = {}
+        self.state, self.sent = '', dict[int, float]()
         self.latencies_s: list[float] = []
         self.images = self.node.create_publisher(Image, 'image_raw', 10)
         self.odometry = self.node.create_publisher(Odometry, 'odom', 1000)
-        self.node.create_subscription(PoseWithCovarianceStamped, 'ekf/pose', self.hear, 100)
+        listen = self.node.create_subscription
+        listen(PoseWithCovarianceStamped, 'ekf/pose', self.hear, 100)
+        listen(String, 'ekf/state', self.hear_state, latched_qos())
 
     def hear(self, message: PoseWithCovarianceStamped) -> None:
         """Note when the pose of an image comes."""
@@ -75,24 +77,9 @@ class Driver:
         if sent_s is not None:
             self.latencies_s.append(time.perf_counter() - sent_s)
 
-    def stand(self, rate_hz: float, seconds: float) -> None:
-        """Send images and odometry of a robot that stands."""
-        self.sent.clear()
-        self.latencies_s.clear()
-        start, images, moves = time.perf_counter(), 0, 0
-        while (now := time.perf_counter() - start) < seconds:
-            if now >= moves / ODOMETRY_HZ:
-                self.move(time.time_ns(), np.zeros(3), (0.0, 0.0))
-                moves += 1
-            elif now >= images / rate_hz:
-                panorama = next(self.panoramas)
-                panorama[3::6, ::3, 0] ^= 1  # never the same twice
-                panorama[0, 0] = time.time_ns() % 251
-                self.show(panorama, time.time_ns())
-                images += 1
-            else:
-                time.sleep(0.0005)
-        time.sleep(IDLE_S)
+    def hear_state(self, message: String) -> None:
+        """Note the state of the filter."""
+        self.state = message.data
 
     def move(self, stamp_ns: int, pose: Any, twist: Any) -> None:
         """Send one odometry message."""
@@ -109,6 +96,42 @@ class Driver:
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
+
+
+class Shuttle(Driver):
+    """Drives to and fro along the path of a bag."""
+
+    def __init__(self, bag: Path) -> None:
+        super().__init__()
+        images, poses = images_and_poses(bag)
+        poses[:, 2] = np.unwrap(poses[:, 2])
+        order = [*range(len(images)), *range(len(images) - 2, 0, -1)]
+        self.views, self.poses, self.passed = images[order], poses[order], 0
+
+    def drive(self, rate_hz: float, seconds: float) -> None:
+        """Drive in real time, so fast that images come at this rate."""
+        self.sent.clear()
+        self.latencies_s.clear()
+        start, images, moves = time.perf_counter(), 0, 0
+        while (now := time.perf_counter() - start) < seconds:
+            if now >= moves / ODOMETRY_HZ:
+                place = self.passed + now * rate_hz
+                pose, move = self.pose(place), self.pose(place + 0.5) - self.pose(place - 0.5)
+                speed = np.cos(pose[2]) * move[0] + np.sin(pose[2]) * move[1]
+                self.move(time.time_ns(), pose, rate_hz * np.array([speed, move[2]]))
+                moves += 1
+            elif now >= images / rate_hz:
+                self.show(self.views[(self.passed + images) % len(self.views)], time.time_ns())
+                images += 1
+            else:
+                time.sleep(0.0005)
+        self.passed += images
+        time.sleep(IDLE_S)
+
+    def pose(self, place: float) -> np.ndarray:
+        """Return the pose of the odometry there, in images from the start."""
+        turns = {'xp': np.arange(len(self.poses)), 'period': len(self.poses)}
+        return np.array([np.interp(place, fp=column, **turns) for column in self.poses.T])
 
 
 def parameters_of(model: PlaceModel, path: Path | str) -> dict[str, list[str]]:
@@ -143,15 +166,14 @@ def cpu_s(processes: list[Any]) -> float:
 def bench_nodes(path: Path, bag: Path, seconds: float = 8.0) -> dict[str, float]:
     """Share of a core at 10 and 30 images a second, and the latency at 30, in ms."""
     parameters = parameters_of(PlaceModel.load(path), path)
-    parameters['ekf_node'] = ['initial_pose:=[0.0, 0.0, 0.0]']
-    driver, figures = Driver(images_of(bag)), {}
+    driver, figures = Shuttle(bag), {}
     try:
         with running(parameters) as processes:
-            if not until(lambda: driver.stand(10.0, 0.5) or driver.latencies_s):
-                raise RuntimeError('the nodes do not answer')
+            if not until(lambda: driver.drive(10.0, 3.0) or driver.state.startswith('LOCALISED')):
+                raise RuntimeError('the nodes do not find the robot')
             for rate_hz in (10, 30):
                 before = cpu_s(processes)
-                driver.stand(rate_hz, seconds)
+                driver.drive(rate_hz, seconds)
                 figures[f'cpu_{rate_hz}_hz'] = (cpu_s(processes) - before) / (seconds + IDLE_S)
             median, late = np.percentile(driver.latencies_s, [50, 99]) * 1e3
             return {**figures, 'latency_p50_ms': float(median), 'latency_p99_ms': float(late)}

@@ -25,7 +25,6 @@ import numpy as np
 import psutil
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from std_msgs.msg import String
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -34,7 +33,6 @@ from cylinder_worlds import Spheres, place, recipe
 
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.data.threads import one_core
-from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.place_model import PlaceModel
 
 START_NS = 1_700_000_000_000_000_000
@@ -67,13 +65,11 @@ class Robot(Driver):
         angles = np.arange(VIEWS) * (2 * np.pi / VIEWS)
         poses = lap(angles * RADIUS * ODOMETRY_HZ / SPEED)
         self.views = Spheres.about(1).panoramas(poses, recipe().panorama)
-        super().__init__(self.views)
-        self.state, self.errors_m = '', deque[float](maxlen=500)
+        super().__init__()
+        self.errors_m = deque[float](maxlen=500)
         self.step = self.answered = self.unanswered = self.driven_ns = 0
         self.heard = threading.Condition()
-        listen = self.node.create_subscription
-        listen(Odometry, 'ekf/odometry', self.hear_odometry, 1)
-        listen(String, 'ekf/state', self.hear_state, latched_qos())
+        self.node.create_subscription(Odometry, 'ekf/odometry', self.hear_odometry, 1)
 
     def hear(self, message: PoseWithCovarianceStamped) -> None:
         """Note the latency and the error of a pose."""
@@ -91,10 +87,6 @@ class Robot(Driver):
         with self.heard:
             self.driven_ns = read_stamp(message.header.stamp)
             self.heard.notify()
-
-    def hear_state(self, message: String) -> None:
-        """Note the state of the filter."""
-        self.state = message.data
 
     def drive(self) -> None:
         """Send the next odometry, and every tenth time an image."""
