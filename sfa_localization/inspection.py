@@ -224,10 +224,9 @@ class BagReport:
         lines += [f'  {line}' for line in self.motion.as_text()] if self.motion else []
         lines += [f'  problem: {problem}' for problem in self.problems]
         lines += [f'  note: {note}' for note in self.notes]
-        camera = self.camera.entry(self.path) if self.camera else ''
-        if entries := [entry for entry in (camera, body.blind_sectors(self.bodies)) if entry]:
+        if entry := self.camera.entry(self.path) if self.camera else '':
             lines += ['  start my_localization.yaml with:', '    /**/omnicam_node:']
-            lines += ['      ros__parameters:', *(f'        {entry}' for entry in entries)]
+            lines += ['      ros__parameters:', f'        {entry}']
         lines += [f'  not enough to train on: {lack}' for lack in self.lacks]
         return '\n'.join(lines if self.lacks else [*lines, '  enough to train on'])
 

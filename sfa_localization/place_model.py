@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfa_localization.camera.panorama import filled
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.array_files import Arrays, read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
@@ -103,10 +104,7 @@ class PlaceModel:
     def masked(self, panoramas: Image) -> Image:
         """Panoramas (T, H, W, 3) without what hides the view; unchanged those that are masked."""
         require_size(panoramas, self.network.architecture)
-        if self.repeated is None:
-            return panoramas
-        pixels = panoramas.reshape(len(panoramas), -1, 3)
-        return pixels[:, self.repeated.ravel()].reshape(panoramas.shape)
+        return panoramas if self.repeated is None else filled(panoramas, self.repeated)
 
     def views(self, panoramas: Image) -> list[View]:
         """Textures of panoramas (T, H, W, 3), leveled by keyframes."""

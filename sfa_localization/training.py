@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from sfa_localization.bags.drives import image_folder, read_drives
-from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.panorama import Unwrapper, repeated_pixels
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
@@ -136,7 +136,7 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     quality |= {'origin': origin} if (origin := given.runs[-1].origin) else {}
     quality |= {'segments': len(segments), **images.quality, **result.quality}
     quality |= keyframe_map.quality
-    unwrapper = Unwrapper(given.recipe.camera, given.panorama)
+    seen = given.runs[0].seen
     rig = rig_of(given.drives, segments)
     drive = np.concatenate([np.full(len(segment.images), segment.run) for segment in segments])
     model = PlaceModel(
@@ -149,7 +149,7 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         quality,
         keyframe_map.correlation,
         rig,
-        repeated=unwrapper.repeated,
-        mount_rpy=unwrapper.mount_rpy,
+        repeated=None if seen is None else repeated_pixels(seen),
+        mount_rpy=Unwrapper(given.recipe.camera, given.panorama).mount_rpy,
     )
     return Trained(model, given.runs, images.slow, segments, result)

@@ -14,6 +14,7 @@ import numpy as np
 from sfa_localization.bags.drives import ReadingRecipe
 from sfa_localization.camera import body
 from sfa_localization.camera.kinds import require_single_view
+from sfa_localization.camera.leveling import MaskedPanoramas
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings, turns_and_textures
 from sfa_localization.data.errors import DataError
@@ -74,15 +75,14 @@ class TrainingInput:
     @classmethod
     def of(cls, runs: Sequence[Run], recipe: Recipe, progress: bool = False) -> TrainingInput:
         """Step 2: level the images, find loop closures, and with them calibrate the odometry."""
+        runs = unhidden(runs, recipe.panorama.sphere)
         total = sum(len(run.panoramas) for run in runs)
         with progress_bar(titled(2, 'level the images'), visible=progress) as bar:
             runs = leveled_runs(runs, recipe.panorama.sphere, bar.update)
         with progress_bar(titled(2, 'find loop closures'), total, visible=progress) as bar:
             views = views_of(runs, bar.update)
-        if masks := [run.seen for run in runs if run.seen is not None]:
-            seen = np.logical_and.reduce(masks)
+        if (seen := runs[0].seen) is not None:
             views = replace(views, seen=seen_in(seen, *views.textures.shape[1:]))
-        _warn_of_bodies(runs, views, recipe.panorama.sphere)
         closures = find_closures(views, recipe.panorama.clockwise)
         runs = same_scale(runs, closures)
         points = points_of(runs, recipe.metric.points)
@@ -194,14 +194,22 @@ def _warn(run: Run, texts: Sequence[str]) -> None:
         logger.warning('%s: %s', run.name, text)
 
 
-def _warn_of_bodies(runs: Sequence[Run], views: Textures, sphere: Sphere) -> None:
-    """Warn of what hides the view in all images of a drive."""
-    rows = channels(views.textures.shape[1])[0]
-    for number, run in enumerate(runs):
-        textures, stamps = views.textures[views.run == number], run.panoramas.stamps_ns
-        chosen = evenly(len(stamps), body.IMAGES)
-        headings = run.odometry.trajectory.at(stamps[chosen])[:, 2]
-        _warn(run, body.sentences(body.bodies(textures[chosen][:, rows], headings, sphere)))
+def unhidden(runs: Sequence[Run], sphere: Sphere) -> list[Run]:
+    """The runs without what hides the view of any: masks, and the robot itself."""
+    masks = [run.seen for run in runs if run.seen is not None]
+    for run in runs:
+        chosen = evenly(len(run.panoramas), body.IMAGES)
+        textures = views_of([run], chosen=chosen).textures
+        yaw = run.odometry.trajectory.at(run.panoramas.stamps_ns[chosen])[:, 2]
+        if bodies := body.bodies(textures[:, channels(textures.shape[1])[0]], yaw, sphere):
+            _warn(run, body.sentences(bodies))
+            masks.append(body.seen_beside(bodies, run.panoramas.shape[:2], sphere))
+    if not masks:
+        return list(runs)
+    seen = np.logical_and.reduce(masks)
+    return [
+        replace(run, panoramas=MaskedPanoramas.of(run.panoramas, seen), seen=seen) for run in runs
+    ]
 
 
 def drive_of(run: Run) -> Drive:

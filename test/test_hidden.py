@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cylinder_worlds import Spheres, alone
+from cylinder_worlds import Spheres, alone, place, recipe, run_in, visit, wander
 
-from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.panorama import Unwrapper, filled, repeated_pixels
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.keyframes.hidden import (
@@ -29,6 +29,7 @@ from sfa_localization.keyframes.texture import (
     turned,
 )
 from sfa_localization.keyframes.training import choose_keyframes, fit_among
+from sfa_localization.training import learn_place
 
 CONFIG = PanoramaConfig(width=120, height=24)
 SECTOR = 150.0, 210.0
@@ -42,8 +43,7 @@ def camera(config=CONFIG):
 def pictures(poses, config=CONFIG):
     """Textures of what is not hidden, and the images (N, H, W, 3)."""
     images = np.clip(WORLD.panoramas(poses, config), 0, 255).astype(np.uint8)
-    pixels = images.reshape(len(images), -1, 3)[:, camera(config).repeated.ravel()]
-    images = pixels.reshape(images.shape)
+    images = filled(images, repeated_pixels(camera(config).visible((config.height, config.width))))
     return quantized(np.stack([texture(image) for image in images])), images
 
 
@@ -155,3 +155,17 @@ def test_a_keyframe_that_is_left_out_does_not_see_what_others_filled_in():
     after = fit_among(replace(keyframes, values=values), row, among)
     np.testing.assert_allclose(after.place, before.place, atol=0.01)
     assert after.yaw == pytest.approx(before.yaw, abs=0.01)
+
+
+def test_a_model_does_without_what_stays_the_same_while_the_robot_turns():
+    """Then images are located whatever hides that part."""
+    run = run_in(Spheres.about(1), wander(400, 2, hz=4.0), recipe().panorama)
+    images, body = run.panoramas.read(0, 400), slice(28, 46)
+    images[:, :, body] = np.random.default_rng(4).integers(0, 256, (12, 18, 3))
+    model = learn_place(place().model.network, [run], recipe()).model
+    hidden = (model.repeated != np.arange(12 * 72).reshape(12, 72)).all(axis=0)
+    assert hidden[body].all() and hidden.sum() <= 18 + 4
+    seen, poses = np.concatenate([*visit().panoramas.batches(64)]), visit().odometry.poses
+    seen[:, :, body] = 90
+    places = np.array([observation.pose for observation in model.locate_all(seen)])
+    assert np.hypot(*(places - poses)[:, :2].T).mean() < 0.05

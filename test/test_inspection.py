@@ -167,10 +167,11 @@ STRIPES = np.random.default_rng(5).integers(0, 256, (12, 1, 3), np.uint8)
 
 
 @pytest.mark.parametrize(('parts', 'said'), [
-    ([(0, 20, 40, STRIPES)], 'blind_sectors: [294.0, 66.0]'),
-    ([(0, 0, 10, 90), (0, 50, 60, 90)], 'blind_sectors: [114.0, 246.0]'),
-    ([(0, 0, 6, 0), (0, 30, 34, STRIPES)], 'blind_sectors: [330.0, 6.0, 120.0, 204.0]'),
-    ([(6, 10, 25, 40)], 'the lower 50% of the view from 24 to 126 degrees'),
+    ([(0, 20, 40, STRIPES)], ': the view from 294 to 66 degrees'),
+    ([(0, 0, 10, 90), (0, 50, 60, 90)], ': the view from 114 to 246 degrees'),
+    ([(0, 0, 6, 0), (0, 30, 34, STRIPES)], ': the view from 120 to 204 degrees'),
+    ([(0, 0, 6, 0), (0, 30, 34, STRIPES)], ': the view from 330 to 6 degrees'),
+    ([(6, 10, 25, 40)], ': the lower 50% of the view from 24 to 126 degrees'),
     ([], ''),
 ])  # fmt: skip
 def test_what_stays_the_same_while_the_robot_turns_is_the_robot(parts, said, tmp_path):
@@ -180,7 +181,6 @@ def test_what_stays_the_same_while_the_robot_turns_is_the_robot(parts, said, tmp
     report = inspect(write(tmp_path / 'bag', shape=(12, 60), body=parts), config=ENOUGH)
     text = report.as_text()
     assert said in text and ('shows the robot' in text) == bool(said)
-    assert ('        blind_sectors: [' in text) == ('blind_sectors' in said)
 
 
 def test_of_a_robot_that_hardly_turns_nothing_is_said(tmp_path):

@@ -16,7 +16,13 @@ from sfa_localization.bags.decoding import typestore
 from sfa_localization.bags.drives import ReadingRecipe, as_live, read_drive
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.lenses import make_camera
-from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama, panorama_rays
+from sfa_localization.camera.panorama import (
+    Unwrapper,
+    filled,
+    looks_like_panorama,
+    panorama_rays,
+    repeated_pixels,
+)
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError, ConfigError
 
@@ -187,7 +193,7 @@ def test_a_panorama_that_the_camera_gives_is_mounted_and_masked(model, clockwise
         config = CameraConfig(camera_model=model, mount_rpy=mount)
         unwrapper = Unwrapper(config, panorama)
         seen = unwrapper.visible(size)
-        assert 0.7 < seen.mean() < 1.0 and unwrapper.repeated is None
+        assert 0.7 < seen.mean() < 1.0 and unwrapper.seen(size) is None
         assert unwrapper.mount_rpy == mount
         tilted = picture_of(smooth, lens, size, mount)[:, order]
         assert psnr(unwrapper(tilted)[seen], direct(smooth, panorama)[seen]) > 30
@@ -202,10 +208,10 @@ def test_a_panorama_that_the_camera_gives_is_mounted_and_masked(model, clockwise
             np.testing.assert_array_equal(unwrapper.visible(size), seen)
             assert np.abs(result[seen] - direct(smooth, panorama)[seen]).max() < 4
             # A model masks again: nothing changes.
-            again = result.reshape(-1, 3)[unwrapper.repeated]
-            np.testing.assert_array_equal(again, result)
+            again = filled(result[None], repeated_pixels(unwrapper.seen(size)))
+            np.testing.assert_array_equal(again[0], result)
     untouched = Unwrapper(CameraConfig(camera_model=model), panorama)
-    assert untouched.repeated is None and untouched.mount_rpy == ()
+    assert untouched.seen(size) is None and untouched.mount_rpy == ()
 
 
 def test_recorded_panoramas_are_mounted_and_masked_in_their_size(tmp_path):

@@ -13,7 +13,7 @@ from cylinder_worlds import place, visit
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from sfa_localization import evaluation, training, updating
-from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.panorama import Unwrapper, repeated_pixels
 from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.data.array_files import read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
@@ -128,7 +128,8 @@ def test_a_model_is_the_same_after_it_was_saved(model, saved, pictures, tmp_path
 def test_a_model_masks_what_it_has_not_seen_in_training(model, pictures, tmp_path):
     """Whoever gives it panoramas: masked or not, they show the same."""
     camera = Unwrapper(CameraConfig(blind_sectors=(150.0, 210.0)), model.panorama)
-    masked = replace(model, repeated=camera.repeated, mount_rpy=(5.0, 0.0, 30.0))
+    repeated = repeated_pixels(camera.visible((1, 4)))
+    masked = replace(model, repeated=repeated, mount_rpy=(5.0, 0.0, 30.0))
     masked.save(tmp_path / 'masked.npz')
     masked = PlaceModel.load(tmp_path / 'masked.npz')
     assert masked.mount_rpy == (5.0, 0.0, 30.0)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Mask
 from sfa_localization.data.sphere import Sphere
 
 STILL = 0.4
@@ -24,7 +24,6 @@ IMAGES = 400
 _WIDEST = 0.6
 # Headings count alike, in bins of 30 degrees with enough images; of fewer bins, nothing is certain.
 _BINS, _FEWEST_IMAGES, _FEWEST_BINS = 12, 5, 6
-_MASK = 'draw this part black in an image of the panorama, and set mask_file to it'
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,24 +37,24 @@ class Body:
     top: float
 
 
-def blind_sectors(bodies: Sequence[Body]) -> str:
-    """The parameter of omnicam_node that hides those with all rows; '' for none."""
-    edges = [f'{edge:.1f}' for body in bodies if not body.top for edge in (body.start, body.end)]
-    return f'blind_sectors: [{", ".join(edges)}]' if edges else ''
+def seen_beside(bodies: Sequence[Body], size: tuple[int, int], sphere: Sphere) -> Mask:
+    """The pixels of panoramas of a size (H, W) that do not show the robot."""
+    (height, width), seen = size, np.ones(size, bool)
+    azimuth = np.degrees(sphere.azimuths(width))
+    for body in bodies:
+        columns = (azimuth - body.start) % 360.0 <= (body.end - body.start) % 360.0
+        seen[int(body.top * height) :, columns] = False
+    return seen
 
 
 def sentences(bodies: Sequence[Body]) -> list[str]:
-    """What hides the view, and the remedy."""
-    texts = []
-    for body in bodies:
-        part, remedy = 'the view', f'set {blind_sectors(bodies)}'
-        if body.top:
-            part, remedy = f'the lower {1 - body.top:.0%} of the view', _MASK
-        texts.append(
-            f'{part} from {body.start:.0f} to {body.end:.0f} degrees (0: forward, 90: left) stays '
-            f'the same while the robot turns, so it shows the robot: {remedy}'
-        )
-    return texts
+    """What hides the view."""
+    return [
+        f'{f"the lower {1 - body.top:.0%} of " if body.top else ""}the view from {body.start:.0f} '
+        f'to {body.end:.0f} degrees (0: forward, 90: left) stays the same while the robot turns, '
+        'so it shows the robot: the model does without it'
+        for body in bodies
+    ]
 
 
 def bodies(textures: NDArray[np.int8], yaw: Array, sphere: Sphere) -> list[Body]:

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.camera.panorama import filled, repeated_pixels
+from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.run import Image, Panoramas, Stamps
 from sfa_localization.data.sphere import Sphere, rotation
 
@@ -47,17 +48,11 @@ def _rotated(panorama: Image, turn: Array, sphere: Sphere) -> Image:
 
 
 @dataclass(frozen=True, slots=True)
-class LeveledPanoramas:
-    """Panoramas leveled by their `tilts` (N, 2), roll and pitch rad."""
+class ChangedPanoramas:
+    """Panoramas that are changed as they are read."""
 
     stamps_ns: Stamps
     panoramas: Panoramas
-    tilts: Array
-    sphere: Sphere
-
-    @classmethod
-    def of(cls, panoramas: Panoramas, tilts: Array, sphere: Sphere) -> LeveledPanoramas:
-        return cls(panoramas.stamps_ns, panoramas, tilts, sphere)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -67,13 +62,43 @@ class LeveledPanoramas:
         return len(self.panoramas)
 
     def read(self, start: int, stop: int) -> Image:
-        return self._leveled(self.panoramas.read(start, stop), start)
+        return self._changed(self.panoramas.read(start, stop), start)
 
     def batches(self, size: int) -> Iterator[Image]:
         for k, images in enumerate(self.panoramas.batches(size)):
-            yield self._leveled(images, k * size)
+            yield self._changed(images, k * size)
 
-    def _leveled(self, images: Image, start: int) -> Image:
+    def _changed(self, images: Image, start: int) -> Image:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, slots=True)
+class MaskedPanoramas(ChangedPanoramas):
+    """Panoramas whose pixels (H, W) repeat those of `repeated`."""
+
+    repeated: Indices
+
+    @classmethod
+    def of(cls, panoramas: Panoramas, seen: Mask) -> MaskedPanoramas:
+        """Panoramas of which only the pixels `seen` (H, W) are used."""
+        return cls(panoramas.stamps_ns, panoramas, repeated_pixels(seen))
+
+    def _changed(self, images: Image, start: int) -> Image:
+        return filled(images, self.repeated)
+
+
+@dataclass(frozen=True, slots=True)
+class LeveledPanoramas(ChangedPanoramas):
+    """Panoramas leveled by their `tilts` (N, 2), roll and pitch rad."""
+
+    tilts: Array
+    sphere: Sphere
+
+    @classmethod
+    def of(cls, panoramas: Panoramas, tilts: Array, sphere: Sphere) -> LeveledPanoramas:
+        return cls(panoramas.stamps_ns, panoramas, tilts, sphere)
+
+    def _changed(self, images: Image, start: int) -> Image:
         tilts = self.tilts[start : start + len(images)]
         steep = np.flatnonzero(np.hypot(*tilts.T) >= TILTED_RAD)
         images = images.copy() if len(steep) else images

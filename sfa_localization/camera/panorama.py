@@ -46,7 +46,7 @@ class _Tables:
     fractions: NDArray[np.uint16]
     border: int
     visible: Mask
-    repeated: Indices | None
+    hides: bool
 
 
 class Unwrapper:
@@ -107,7 +107,7 @@ class Unwrapper:
         neither a mask nor a sector hides any.
         """
         tables = self._tables_of(size)
-        return None if tables.repeated is None else tables.visible
+        return tables.visible if tables.hides else None
 
     def check(self, size: tuple[int, int] | None = None) -> None:
         """Raise CameraError for a lens, mount, mask or sector that cannot be used for images of
@@ -125,12 +125,6 @@ class Unwrapper:
         if self.model == 'panorama':
             return True
         return self.model != 'equirectangular' and looks_like_panorama(*size)
-
-    @property
-    def repeated(self) -> Indices | None:
-        """The pixel of a panorama, row by row, that each (H, W) repeats; None: all are visible."""
-        size = self.panorama.height, self.panorama.width
-        return build_tables(*self._of_panoramas(), self.panorama, size).repeated
 
     @property
     def mount_rpy(self) -> tuple[float, ...]:
@@ -201,8 +195,8 @@ def build_tables(
     rows = np.clip(rows, 0, size[0] - 1)
     maps = cv2.convertMaps(columns.astype(np.float32), rows.astype(np.float32), cv2.CV_16SC2)
     border = cv2.BORDER_WRAP if wraps else cv2.BORDER_REPLICATE
-    repeated = from_rows * panorama.width + from_columns if hidden.any() else None
-    return _Tables(np.asarray(maps[0]), np.asarray(maps[1]), border, visible, repeated)
+    tables = np.asarray(maps[0]), np.asarray(maps[1])
+    return _Tables(*tables, border, visible, bool(hidden.any()))
 
 
 def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
@@ -231,6 +225,18 @@ def read_mask(path: str, size: tuple[int, int]) -> Mask:
     mask = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     resized = cv2.resize(mask, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
     return np.asarray(resized) >= 128
+
+
+def filled(panoramas: Image, repeated: Indices) -> Image:
+    """Panoramas (N, H, W, 3) whose pixels (H, W) repeat others, see `repeated_pixels`."""
+    pixels = panoramas.reshape(len(panoramas), -1, 3)
+    return np.asarray(pixels[:, repeated.ravel()].reshape(panoramas.shape))
+
+
+def repeated_pixels(visible: Mask) -> Indices:
+    """The visible pixel, row by row, that each pixel of `visible` (H, W) repeats."""
+    rows, columns = nearest_visible(visible)
+    return np.asarray(rows * visible.shape[1] + columns)
 
 
 def nearest_visible(visible: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
