@@ -25,6 +25,7 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.bags.topic_stream import Stream, clock_offset
 from sfa_localization.camera import body, kinds
+from sfa_localization.camera.leveling import leaning
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import VisualGyro
@@ -420,6 +421,10 @@ class _Survey:
         pairs = tilt_pairs(images, self._sphere)
         if len(pairs.tilt) < TILT_PAIRS:
             return ''
+        if pairs.leans:
+            said = leaning(pairs.lean.real, pairs.lean.imag)
+            self._report.notes.append(f'the camera {said}: the model levels its images')
+            pairs = pairs.upright()
         squares = np.abs(pairs.tilts(np.zeros(len(images.images), complex))) ** 2
         tilt = math.degrees(math.sqrt(float(squares.mean()) / 2))  # along each axis
         return f'tilts the camera by at least {tilt:.1f} degrees'

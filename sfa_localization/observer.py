@@ -55,7 +55,7 @@ class Observer:
         """Observe panoramas (T, H, W, 3) with stamps (T,) at once, which is faster."""
         if len(panoramas):
             self._require_size(panoramas[0])
-        panoramas = self.model.masked(panoramas)
+        panoramas = self.model.prepared(panoramas)
         judged = [self._judge(panorama) for panorama in panoramas]
         views = self.model.views(panoramas)
         return [

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfa_localization.camera.leveling import leveled
 from sfa_localization.camera.panorama import filled
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.array_files import Arrays, read_arrays, write_arrays
@@ -72,7 +73,8 @@ class PlaceModel:
     `ground` where it drove. Map and keyframes hold places of the camera. The map reads `turned`
     maps, or slow features where there are none. Where the robot hides its view, pixels (H, W)
     repeat those of `repeated`. `mount_rpy`, degrees, are the angles of a camera that gives
-    panoramas, by which these were resampled; () if they were not.
+    panoramas, by which these were resampled; `lean`, rad, are roll and pitch of the camera then,
+    which images show; () if there are none.
     """
 
     network: Network
@@ -86,6 +88,7 @@ class PlaceModel:
     rig: Rig = field(default_factory=Rig)
     repeated: Indices | None = None
     mount_rpy: tuple[float, ...] = ()
+    lean: tuple[float, ...] = ()
 
     def locate(self, panorama: Image) -> Observation:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
@@ -98,13 +101,18 @@ class PlaceModel:
     @one_core()
     def locate_all(self, panoramas: Image) -> list[Observation]:
         """What panoramas (T, H, W, 3) show, each by itself."""
-        views = self.views(self.masked(panoramas))
+        views = self.views(self.prepared(panoramas))
         return [self.observed(view, self.located(view, Conditions())) for view in views]
 
-    def masked(self, panoramas: Image) -> Image:
-        """Panoramas (T, H, W, 3) without what hides the view; unchanged those that are masked."""
+    def prepared(self, panoramas: Image) -> Image:
+        """Panoramas (T, H, W, 3) without what hides the view, as by an upright camera."""
         require_size(panoramas, self.network.architecture)
-        return panoramas if self.repeated is None else filled(panoramas, self.repeated)
+        if self.repeated is not None:
+            panoramas = filled(panoramas, self.repeated)
+        if not self.lean:
+            return panoramas
+        lean, sphere = np.array(self.lean), self.panorama.sphere
+        return np.stack([leveled(panorama, lean, sphere) for panorama in panoramas])
 
     def views(self, panoramas: Image) -> list[View]:
         """Textures of panoramas (T, H, W, 3), leveled by keyframes."""
@@ -204,6 +212,7 @@ class PlaceModel:
             'error_correlation': dataclasses.asdict(self.error_correlation),
             'rig': self.rig.to_mapping(),
             'mount_rpy': self.mount_rpy,
+            'lean': self.lean,
         }
 
     def _arrays(self) -> Arrays:
@@ -236,6 +245,7 @@ class PlaceModel:
             Rig.from_mapping(header['rig']),
             arrays.get('repeated'),
             tuple(header.get('mount_rpy', ())),
+            tuple(header.get('lean', ())),
         )
 
 

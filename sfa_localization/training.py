@@ -136,7 +136,6 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     quality |= {'origin': origin} if (origin := given.runs[-1].origin) else {}
     quality |= {'segments': len(segments), **images.quality, **result.quality}
     quality |= keyframe_map.quality
-    seen = given.runs[0].seen
     rig = rig_of(given.drives, segments)
     drive = np.concatenate([np.full(len(segment.images), segment.run) for segment in segments])
     model = PlaceModel(
@@ -149,7 +148,8 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         quality,
         keyframe_map.correlation,
         rig,
-        repeated=None if seen is None else repeated_pixels(seen),
+        repeated=None if given.seen is None else repeated_pixels(given.seen),
+        lean=tuple(given.lean.tolist()) if given.lean.any() else (),
         mount_rpy=Unwrapper(given.recipe.camera, given.panorama).mount_rpy,
     )
     return Trained(model, given.runs, images.slow, segments, result)

@@ -14,11 +14,12 @@ import numpy as np
 from sfa_localization.bags.drives import ReadingRecipe
 from sfa_localization.camera import body
 from sfa_localization.camera.kinds import require_single_view
-from sfa_localization.camera.leveling import MaskedPanoramas
+from sfa_localization.camera.leveling import MaskedPanoramas, leaning
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings, turns_and_textures
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
+from sfa_localization.data.geometry import Array, Mask
 from sfa_localization.data.progress import announce, progress_bar
 from sfa_localization.data.run import Run
 from sfa_localization.data.sphere import Sphere
@@ -27,7 +28,7 @@ from sfa_localization.fusion.camera_clock import camera_clock
 from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.keyframes.closures import Textures, find_closures, views_of
 from sfa_localization.keyframes.hidden import seen_in
-from sfa_localization.keyframes.leveling import leveled_runs
+from sfa_localization.keyframes.leveling import camera_lean, leveled_runs, upright_run
 from sfa_localization.keyframes.texture import channels
 from sfa_localization.metric.dead_reckoning import OdometryTrack
 from sfa_localization.metric.drives import Drive, Drives
@@ -65,24 +66,34 @@ class Recipe(ReadingRecipe):
 
 @dataclass(frozen=True, slots=True)
 class TrainingInput:
-    """Drives with camera clocks and loop closures, the `views` that show them, and the recipe."""
+    """Drives with camera clocks and loop closures, the `views` that show them, and the recipe.
+
+    The camera has `seen` some pixels (H, W) only, or all: None. It leans by roll and pitch (2,)
+    rad.
+    """
 
     drives: Drives
     views: Textures
     recipe: Recipe
+    seen: Mask | None
+    lean: Array
     progress: bool = False
 
     @classmethod
     def of(cls, runs: Sequence[Run], recipe: Recipe, progress: bool = False) -> TrainingInput:
         """Step 2: level the images, find loop closures, and with them calibrate the odometry."""
-        runs = unhidden(runs, recipe.panorama.sphere)
+        runs, sphere = unhidden(runs, recipe.panorama.sphere), recipe.panorama.sphere
+        seen, lean = runs[0].seen, camera_lean(runs, sphere)
+        if lean.any():
+            logger.warning('the camera %s: the model levels its images', leaning(*lean))
+        runs = [upright_run(run, lean, sphere) for run in runs]
         total = sum(len(run.panoramas) for run in runs)
         with progress_bar(titled(2, 'level the images'), visible=progress) as bar:
-            runs = leveled_runs(runs, recipe.panorama.sphere, bar.update)
+            runs = leveled_runs(runs, sphere, bar.update)
         with progress_bar(titled(2, 'find loop closures'), total, visible=progress) as bar:
             views = views_of(runs, bar.update)
-        if (seen := runs[0].seen) is not None:
-            views = replace(views, seen=seen_in(seen, *views.textures.shape[1:]))
+        if runs[0].seen is not None:
+            views = replace(views, seen=seen_in(runs[0].seen, *views.textures.shape[1:]))
         closures = find_closures(views, recipe.panorama.clockwise)
         runs = same_scale(runs, closures)
         points = points_of(runs, recipe.metric.points)
@@ -91,8 +102,8 @@ class TrainingInput:
             lever_arm = complex(*recipe.metric.camera_xy)
         items, mount = tuple(map(drive_of, runs)), Mount.at(lever_arm)
         drives = Drives(items, closures, recipe.segments, points=points, mount=mount)
-        drives = drives.measured(views, recipe.panorama.sphere)
-        return cls(drives, views, recipe, progress)
+        drives = drives.measured(views, sphere)
+        return cls(drives, views, recipe, seen, lean, progress)
 
     @property
     def runs(self) -> tuple[Run, ...]:

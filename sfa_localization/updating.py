@@ -202,9 +202,9 @@ def _textures(
     """Textures (M, rows, columns) of the chosen images (M,), leveled by their tilts (M, 2)."""
     if not len(chosen):
         return np.zeros((0, 0, 0), np.int8)
-    read = np.concatenate([model.masked(images.read(i, i + 1)) for i in chosen.tolist()])
-    masked = PanoramaArray(images.stamps_ns[chosen], read)
-    leveled = LeveledPanoramas.of(masked, tilts, model.keyframes.sphere)
+    read = np.concatenate([model.prepared(images.read(i, i + 1)) for i in chosen.tolist()])
+    prepared = PanoramaArray(images.stamps_ns[chosen], read)
+    leveled = LeveledPanoramas.of(prepared, tilts, model.keyframes.sphere)
     return quantized(np.stack([texture(image) for image in leveled.read(0, len(chosen))]))
 
 

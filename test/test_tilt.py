@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from cylinder_worlds import Spheres, recipe, run_in, wander
+from cylinder_worlds import Spheres, place, recipe, run_in, visit, wander
 from test_keyframes import HOME, drive, errors, familiar, keyframes_of, unseen
 
 from sfa_localization.camera.leveling import NEAR_NS, tilted, tilts_at
@@ -15,9 +15,11 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.keyframes.keyframes import Keyframes
-from sfa_localization.keyframes.leveling import leveled_runs
+from sfa_localization.keyframes.leveling import camera_lean, leveled_runs
 from sfa_localization.keyframes.texture import spectrum, texture, turned
 from sfa_localization.keyframes.tilt import find_tilt
+from sfa_localization.place_model import PlaceModel
+from sfa_localization.training import learn_place
 
 BOTH = pytest.mark.parametrize('clockwise', [True, False])
 SPHERE = Sphere(-0.6, 0.6)
@@ -91,6 +93,41 @@ def test_drives_are_leveled_before_they_are_learned_from(clockwise):
     assert np.median(rest) < 0.25 * np.median(np.hypot(*tilts.T))
     batches = np.concatenate(list(leveled_run.panoramas.batches(64)))
     assert np.array_equal(batches, leveled_run.panoramas.read(0, 240)) and len(batches) == 240
+
+
+LEAN = np.radians([-4.0, 7.0])
+
+
+def leaning(run):
+    """A run by a camera that leans on its robot by LEAN."""
+    images = np.stack(
+        [tilted(image, LEAN, recipe().panorama.sphere) for image in run.panoramas.images]
+    )
+    return replace(run, panoramas=PanoramaArray(run.panoramas.stamps_ns, images))
+
+
+@BOTH
+def test_a_lean_of_the_camera_is_told_from_slopes_of_the_ground(clockwise):
+    panorama = recipe(clockwise).panorama
+    level = run_in(Spheres.about(1), wander(240, 2, hz=4.0), panorama)
+    images, _ = swayed(level.panoramas.images, 4.0, 0, panorama.sphere)
+    uneven = replace(level, panoramas=PanoramaArray(level.panoramas.stamps_ns, images))
+    for run in (level, uneven):
+        assert not camera_lean([run], panorama.sphere).any()
+    images = [tilted(image, LEAN, panorama.sphere) for image in images]
+    run = replace(level, panoramas=PanoramaArray(level.panoramas.stamps_ns, np.stack(images)))
+    assert np.degrees(np.hypot(*(camera_lean([run], panorama.sphere) - LEAN))) < 2.0
+
+
+def test_a_model_levels_the_images_of_a_camera_that_leans(tmp_path):
+    """As those of its training, wherever they come from."""
+    run = leaning(run_in(Spheres.about(1), wander(400, 2, hz=4.0), recipe().panorama))
+    learn_place(place().model.network, [run], recipe()).model.save(tmp_path / 'model.npz')
+    model = PlaceModel.load(tmp_path / 'model.npz')
+    assert np.degrees(np.hypot(*(model.lean - LEAN))) < 1.0
+    seen = model.locate_all(leaning(visit()).panoramas.images)
+    places = np.array([observation.position for observation in seen])
+    assert np.hypot(*(places - visit().odometry.poses[:, :2]).T).mean() < 0.1
 
 
 def test_the_orientation_of_an_image_is_that_near_its_stamp():

@@ -26,6 +26,15 @@ NEAR_NS = 50_000_000
 correlation time of 0.7 s tilts by one degree meanwhile."""
 
 
+def leaning(roll: float, pitch: float) -> str:
+    """How a camera leans on the robot by roll and pitch, rad."""
+    aside, along = ('right' if roll > 0 else 'left'), ('forward' if pitch > 0 else 'back')
+    return (
+        f'leans by {abs(np.degrees(roll)):.1f} degrees to the {aside} and by '
+        f'{abs(np.degrees(pitch)):.1f} degrees {along}'
+    )
+
+
 def tilted(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
     """A level panorama (H, W, C) as taken by a robot with roll and pitch (2,) rad; its upper and
     lower rows are repeated beyond its edges.

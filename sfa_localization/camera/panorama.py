@@ -103,8 +103,8 @@ class Unwrapper:
         return self._tables_of(size).visible
 
     def seen(self, size: tuple[int, int]) -> Mask | None:
-        """Mask (H, W) of the panorama pixels that images of `size` (rows, columns) show; None where
-        neither a mask nor a sector hides any.
+        """The same mask, but None where neither a mask nor a sector hides any, nor the mount of
+        panoramas moves any beyond their edges.
         """
         tables = self._tables_of(size)
         return tables.visible if tables.hides else None
@@ -195,8 +195,8 @@ def build_tables(
     rows = np.clip(rows, 0, size[0] - 1)
     maps = cv2.convertMaps(columns.astype(np.float32), rows.astype(np.float32), cv2.CV_16SC2)
     border = cv2.BORDER_WRAP if wraps else cv2.BORDER_REPLICATE
-    tables = np.asarray(maps[0]), np.asarray(maps[1])
-    return _Tables(*tables, border, visible, bool(hidden.any()))
+    hides = bool(hidden.any() or (wraps and not visible.all()))
+    return _Tables(np.asarray(maps[0]), np.asarray(maps[1]), border, visible, hides)
 
 
 def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:

@@ -466,8 +466,11 @@ TROUBLES = {
     'body behind, a quarter, hidden': Trouble(
         lambda: body(0.25), (0.15, 0.1), 'SFA, one', camera='blind_sectors: [134.0, 226.0]'
     ),
+    'camera askew': Trouble(
+        lambda: mounted(10.0, 0.0, 30.0), (0.09, 0.065), 'the camera leans by 9.. degrees to the r'
+    ),
     'camera askew, mount_rpy set': Trouble(
-        lambda: mounted(5.0, 0.0, 30.0), (0.07, 0.055), 'SFA, one',
+        lambda: mounted(5.0, 0.0, 30.0), (0.06, 0.05), 'SFA, one',
         camera='mount_rpy: [5.0, 0.0, 30.0]',
     ),
     'truth: 0.15 s early': Trouble(
