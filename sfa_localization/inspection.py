@@ -150,7 +150,7 @@ class BagReport:
     `error` says why it cannot be read at all. `samples` are images from all over the drive, and
     `camera` the kind of camera that they show. `drives` are the poses (M, 3) of images with
     `odometry` in each unbroken part of it; `motion` compares odometry, images and gyroscope; `tilt`
-    is that of the ground; `bodies` hide the view.
+    is that of the ground.
     """
 
     path: str
@@ -168,7 +168,6 @@ class BagReport:
     drives: list[Array] = field(default_factory=list)
     motion: MotionCheck | None = None
     tilt: str = ''
-    bodies: list[body.Body] = field(default_factory=list)
 
     @property
     def places(self) -> Array:
@@ -253,7 +252,6 @@ def inspect(
         _Survey(bag, report, topics, clockwise).fill()
         report.problems = bag.problems
         report.notes += bag.recording.notes
-    report.notes += body.sentences(report.bodies)
     if path_length(report.places) >= MOVED_M:
         report.notes += [ROUTE] if is_route(report.places) else []
         report.notes += [] if headings_differ(report.places) else [NO_LEVER_ARM]
@@ -412,7 +410,8 @@ class _Survey:
         if not (pair and pair.independent):
             headings = odometry.trajectory.at(stamps[rows])[:, 2]
             light = channels(textures.shape[1])[0]
-            self._report.bodies = body.bodies(textures[:, light], headings, self._sphere)
+            robot = body.robot_in_view(textures[:, light], headings)
+            self._report.notes += body.sentences(robot, self._sphere)
         images = Textures(textures, rows, np.zeros_like(rows), driven(odometry, stamps)[rows])
         self._report.tilt = self._report.tilt or self._camera_tilt(images)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from cylinder_worlds import Spheres, alone, place, recipe, run_in, visit, wander
 
+from sfa_localization.camera.body import robot_in_view, seen_mask, sentences
 from sfa_localization.camera.panorama import Unwrapper, filled, repeated_pixels
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
@@ -169,3 +170,22 @@ def test_a_model_does_without_what_stays_the_same_while_the_robot_turns():
     seen[:, :, body] = 90
     places = np.array([observation.pose for observation in model.locate_all(seen)])
     assert np.hypot(*(places - poses)[:, :2].T).mean() < 0.05
+
+
+@pytest.mark.parametrize('clockwise', [True, False])
+def test_parts_of_the_robot_of_any_height_are_told_from_what_is_around(clockwise):
+    """A hood with a mast on it, and a cabin beside it; each with a column more on both sides."""
+    rng = np.random.default_rng(3)
+    textures = rng.integers(-100, 100, (400, 16, 80)).astype(np.int8)
+    fixed = np.zeros((16, 80), bool)
+    fixed[8:, 30:54] = fixed[:, 40:44] = fixed[:, 54:60] = True
+    textures[:, fixed] = rng.integers(-100, 100, fixed.sum())
+    robot = robot_in_view(textures, rng.uniform(-np.pi, np.pi, 400))
+    for columns, row in ((slice(29, 39), 8), (slice(39, 45), 0), (slice(53, 61), 0)):
+        assert robot[row:, columns].all() and not robot[:row, columns].any()
+    assert not robot[:, :29].any() and not robot[:, 61:].any()
+    sphere = replace(CONFIG, clockwise=clockwise).sphere
+    (text,) = sentences(robot, sphere)
+    assert text.startswith('the lower 72% of the view from 266 to 50 degrees') == clockwise
+    assert sentences(robot & False, sphere) == []
+    assert seen_mask(robot, (48, 240)).sum() == 9 * (~robot).sum()

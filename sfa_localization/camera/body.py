@@ -4,9 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -26,61 +23,51 @@ _WIDEST = 0.6
 _BINS, _FEWEST_IMAGES, _FEWEST_BINS = 12, 5, 6
 
 
-@dataclass(frozen=True, slots=True)
-class Body:
-    """What hides the view from azimuth `start` to `end`, degrees counterclockwise from forward, and
-    from the `top`, a share of the height, to the lower edge.
+def seen_mask(robot: Mask, size: tuple[int, int]) -> Mask:
+    """The pixels of panoramas of a size (H, W) beside those of the robot in a mask (rows, columns)
+    of textures.
     """
-
-    start: float
-    end: float
-    top: float
+    rows, columns = (np.arange(n) * m // n for n, m in zip(size, robot.shape, strict=True))
+    return np.asarray(~robot[np.ix_(rows, columns)])
 
 
-def seen_beside(bodies: Sequence[Body], size: tuple[int, int], sphere: Sphere) -> Mask:
-    """The pixels of panoramas of a size (H, W) that do not show the robot."""
-    (height, width), seen = size, np.ones(size, bool)
-    azimuth = np.degrees(sphere.azimuths(width))
-    for body in bodies:
-        columns = (azimuth - body.start) % 360.0 <= (body.end - body.start) % 360.0
-        seen[int(body.top * height) :, columns] = False
-    return seen
+def sentences(robot: Mask, sphere: Sphere) -> list[str]:
+    """What hides the view, by the mask (rows, columns) of the robot."""
+    height, half = robot.mean(axis=0), 180.0 / robot.shape[1]
+    begin = int(np.argmin(height))  # the clearest column
+    ring, texts = np.roll(np.arange(len(height)), -begin), []
+    for (run,) in ndimage.find_objects(ndimage.label(height[ring] > 0)[0]):
+        inside = ring[run]
+        edges = np.degrees(sphere.azimuths(len(height)))[inside[[0, -1]]]
+        start, end = edges[::-1] if sphere.clockwise else edges
+        share = height[inside].mean()
+        part = '' if share == 1 else f'the lower {share:.0%} of '
+        texts.append(
+            f'{part}the view from {(start - half) % 360:.0f} to {(end + half) % 360:.0f} degrees '
+            '(0: forward, 90: left) stays the same while the robot turns, so it shows the robot: '
+            'the model does without it, in all drives'
+        )
+    return texts
 
 
-def sentences(bodies: Sequence[Body]) -> list[str]:
-    """What hides the view."""
-    return [
-        f'{f"the lower {1 - body.top:.0%} of " if body.top else ""}the view from {body.start:.0f} '
-        f'to {body.end:.0f} degrees (0: forward, 90: left) stays the same while the robot turns, '
-        'so it shows the robot: the model does without it'
-        for body in bodies
-    ]
-
-
-def bodies(textures: NDArray[np.int8], yaw: Array, sphere: Sphere) -> list[Body]:
-    """What hides the view all the time, by textures (N, rows, columns) of images from all over a
-    drive, taken at headings `yaw` (N,) rad. Each is a column wider on both sides.
+def robot_in_view(textures: NDArray[np.int8], yaw: Array) -> Mask:
+    """What shows the robot all the time, by textures (N, rows, columns) of images from all over a
+    drive, taken at headings `yaw` (N,) rad: a mask (rows, columns), from below up to a row in each
+    column, with a column more on both sides.
     """
     change = changes(textures, yaw)
     if change is None:
-        return []
-    rows, columns = change.shape
+        return np.zeros(textures.shape[1:], bool)
+    rows = len(change)
     whole = np.maximum(change.mean(0), change[: rows // 2].mean(0)) < STILL
     hidden = whole | (change[-(rows // 3) :].mean(0) < STILL / 2)
     hidden |= np.roll(hidden, 1) & np.roll(hidden, -1)
-    begin = int(np.argmin(hidden))  # a visible column
-    ring = np.roll(np.arange(columns), -begin)
-    runs = ndimage.find_objects(ndimage.label(hidden[ring])[0])
-    parts, half = [], 180.0 / columns
-    for inside in (ring[run] for (run,) in runs if run.stop - run.start > 1):
-        edges = np.degrees(sphere.azimuths(columns)[inside[[0, -1]]])
-        start, end = edges[::-1] if sphere.clockwise else edges
-        # From below, up to the first row that moves.
-        moves = np.median(change[::-1, inside], axis=1) >= STILL
-        top = 1.0 - max(int(np.argmax(moves)) / rows, 1 / 3)
-        top = 0.0 if np.median(whole[inside]) else top
-        parts.append(Body((start - 3 * half) % 360.0, (end + 3 * half) % 360.0, top))
-    return parts
+    hidden &= np.roll(hidden, 1) | np.roll(hidden, -1)
+    moves = ndimage.median_filter(change[::-1], (1, 3), mode='wrap') >= STILL
+    height = np.where(moves.any(axis=0) & ~whole, moves.argmax(axis=0), rows)
+    height = np.where(hidden, np.maximum(height, rows // 3), 0)
+    height = ndimage.maximum_filter1d(height, 3, mode='wrap')
+    return np.asarray(np.arange(rows)[::-1, None] < height)
 
 
 def changes(textures: NDArray[np.int8], yaw: Array) -> Array | None:
