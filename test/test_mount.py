@@ -16,11 +16,13 @@ from sfa_localization.bags.drives import read_drives
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.static_transforms import lever_arm
 from sfa_localization.bags.writer import BagWriter, blank
+from sfa_localization.camera.panorama import filled, repeated_pixels
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity, Rig
 from sfa_localization.keyframes.closures import Textures
+from sfa_localization.keyframes.hidden import seen_in
 from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.keyframes.turning import lever_square
 from sfa_localization.metric.dead_reckoning import OdometryTrack
@@ -206,19 +208,29 @@ def test_images_that_change_in_turns_tell_a_lever_from_wheels_that_slip():
         assert abs(learned_lever - lever) < 0.06, (square, learned_lever)
 
 
+@pytest.mark.parametrize('hidden', [False, True])
 @pytest.mark.parametrize('lever', [0j, 0.1 + 0j, 0.2 - 0.2j])
-def test_images_change_in_turns_as_far_as_the_camera_moves(lever):
-    """On the spot and on straight ways, among things around."""
+def test_images_change_in_turns_as_far_as_the_camera_moves(lever, hidden):
+    """On the spot and on straight ways, among things around, of which the robot hides a sixth."""
     turns = np.linspace(0.0, 6.0, 61)
     spot = np.column_stack([np.zeros((61, 2)), turns])
     ahead = np.column_stack([np.linspace(0.0, 3.0, 31), np.zeros((31, 2))])
     base = np.concatenate([spot, ahead])
     images = Spheres.about(0).panoramas(camera_poses(base, lever), PANORAMA)
+    view = np.ones(images.shape[1:3], bool)
+    if hidden:
+        view[:, : view.shape[1] // 6] = False
+        images = filled(images, repeated_pixels(view))
     textures = np.concatenate([quantized(texture(image)[None]) for image in images])
+    view = seen_in(view, *textures.shape[1:]) if hidden else None
     path = np.concatenate([np.zeros(61), 10.0 + np.linspace(0.0, 3.0, 31)])
     count = np.arange(len(base))
-    seen = lever_square(Textures(textures, count, np.zeros_like(count), path), base[:, 2])
-    assert abs(np.sqrt(seen.value) - abs(lever)) < 0.05 + 0.5 * abs(lever)
+    views = Textures(textures, count, np.zeros_like(count), path, view)
+    seen = lever_square(views, base[:, 2])
+    if hidden:
+        assert abs(seen.value - abs(lever) ** 2) < 0.05  # 3 to 11 if all were compared
+    else:
+        assert abs(np.sqrt(seen.value) - abs(lever)) < 0.05 + 0.5 * abs(lever)
     few = Textures(textures[:20], count[:20], np.zeros(20, int), path[:20])
     assert lever_square(few, base[:20, 2]) is None
 

@@ -11,13 +11,14 @@ and no wheels, so that it tells a lever arm from wheels that slip in turns.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
-from sfa_localization.data.geometry import Array, Indices
+from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.rig import Quantity
 from sfa_localization.data.statistics import evenly
 from sfa_localization.keyframes.closures import Textures
-from sfa_localization.keyframes.texture import correlate, spectra_of
+from sfa_localization.keyframes.hidden import turned_mask
+from sfa_localization.keyframes.texture import Spectra, columns_of, correlate, spectra_of, turned
 
 SPOT_M, TURNS_RAD = 0.02, (0.3, 1.5)
 """The two images of a turn are so near to each other, and turned by so much."""
@@ -48,8 +49,8 @@ def lever_square(views: Textures, yaw: Array) -> Quantity | None:
     if min(spot.sum(), ahead.sum()) < _FEWEST:
         return None
     chord = np.abs(np.exp(1j * turn[spot]) - 1) ** 2
-    turned = _medians(views.textures, first[spot], last[spot], chord)
-    driven = _medians(views.textures, first[ahead], last[ahead], way[ahead] ** 2)
+    turned = _medians(views, first[spot], last[spot], chord)
+    driven = _medians(views, first[ahead], last[ahead], way[ahead] ** 2)
     rows = np.zeros((2 * _GROUPS, 3))
     rows[:, 0], rows[:_GROUPS, 1], rows[_GROUPS:, 2] = 1, turned[:, 0], driven[:, 0]
     changes = np.concatenate([turned[:, 1], driven[:, 1]])
@@ -60,20 +61,39 @@ def lever_square(views: Textures, yaw: Array) -> Quantity | None:
     return Quantity(max(by_turn, 0.0) / by_way, float(std) / by_way) if by_way > 0 else None
 
 
-def _medians(textures: NDArray[np.int8], first: Indices, last: Indices, size: Array) -> Array:
-    """Of pairs (P,) of textures (S, rows, columns), in groups of one size (P,), the medians of that
-    and of their change (groups, 2): minus the logarithm of their correlation at low frequencies,
-    turned to be most alike.
+def _medians(views: Textures, first: Indices, last: Indices, size: Array) -> Array:
+    """Of pairs (P,) of textures, in groups of one size (P,), the medians of that and of their
+    change (groups, 2): minus the logarithm of their correlation at low frequencies, turned to be
+    most alike.
     """
     rows = evenly(len(size), _MOST)
     first, last, size = first[rows], last[rows], size[rows]
-    columns = textures.shape[2]
+    textures, columns = views.textures, views.textures.shape[2]
     used, pairs = np.unique([first, last], return_inverse=True)
     low = spectra_of(textures[used])
     low[:, :, [0, *range(FREQUENCIES + 1, low.shape[2])]] = 0
     norm = np.linalg.norm(low, axis=(1, 2), keepdims=True) * np.sqrt(2 / columns)
     low = np.asarray(low / np.maximum(norm, 1e-9), np.complex64)
-    likeness = [correlate(low[a], low[[b]], columns)[0][0] for a, b in pairs.reshape(2, -1).T]
-    change = -np.log(np.maximum(likeness, 0.05))
+    seen = views.seen
+    if seen is not None:  # without that into which low frequencies carry what was not seen
+        seen = minimum_filter1d(seen, 1 + columns // FREQUENCIES, mode='wrap')
+    likeness = [_likeness(low[a], low[[b]], columns, seen) for a, b in pairs.reshape(2, -1).T]
+    change = -np.log(np.maximum(np.array(likeness, np.float32), 0.05))
     groups = np.array_split(np.argsort(size, kind='stable'), _GROUPS)
     return np.array([[np.median(size[group]), np.median(change[group])] for group in groups])
+
+
+def _likeness(first: Spectra, last: Spectra, columns: int, seen: Mask | None) -> float:
+    """Correlation of spectra (rows, F) and (1, rows, F), turned to be most alike, where both were
+    `seen` (rows, columns).
+    """
+    (score,), (shift,) = correlate(first, last, columns)
+    if seen is None:
+        return float(score)
+    image, best = columns_of(first, columns), 0.0
+    for angle in (shift + np.arange(-2, 2.1, 0.5)) * (2 * np.pi / columns):
+        other = columns_of(turned(last, np.array([angle])), columns)[0]
+        mask = seen & turned_mask(seen, angle)
+        a, b = image[mask], other[mask]
+        best = max(best, float(a @ b / np.sqrt(max((a @ a) * (b @ b), 1e-18))))
+    return best
