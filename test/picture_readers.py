@@ -60,7 +60,7 @@ class PictureReader:
     ground: DrivenGround = dataclasses.field(default_factory=lambda: DROVE)
     mount_rpy: tuple[float, ...] = ()
 
-    def masked(self, images):
+    def prepared(self, images):
         return images
 
     def views(self, images):
