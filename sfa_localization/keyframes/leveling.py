@@ -40,7 +40,7 @@ level cameras seemed to lean by up to 4.4 of them; one that leaned by 8 degrees 
 
 
 def camera_lean(runs: Sequence[Run], sphere: Sphere) -> Array:
-    """Roll and pitch (2,) rad of the camera on the robot; 0 where it leans less than matters."""
+    """Roll and pitch (2,) rad of the camera on the robot; 0 where it does not lean for certain."""
     chosen, lean = evenly(sum(len(run.panoramas) for run in runs), SAMPLES), np.zeros(2)
     for _ in range(_PASSES):
         level = [upright_run(run, lean, sphere) for run in runs]
@@ -108,7 +108,7 @@ class TiltPairs:
 
     @property
     def leans(self) -> bool:
-        """Whether the camera leans for certain, by more than does not matter."""
+        """Whether the camera leans for certain, and by enough to matter."""
         images, rest = max(len(np.unique(self.first)), 1), self.upright().tilt
         squares = np.sum(np.abs(rest) ** 2) / (np.sum(np.abs(1 - self.turn) ** 2) + 1) / images
         return abs(self.lean) > max(float(TILTED_RAD), _CERTAIN * float(np.sqrt(squares)))
