@@ -421,8 +421,7 @@ class _Survey:
         if len(pairs.tilt) < TILT_PAIRS:
             return ''
         if pairs.leans:
-            said = leaning(pairs.lean.real, pairs.lean.imag)
-            self._report.notes.append(f'the camera {said}: the model levels its images')
+            self._report.notes.append(leaning(pairs.lean.real, pairs.lean.imag))
             pairs = pairs.upright()
         squares = np.abs(pairs.tilts(np.zeros(len(images.images), complex))) ** 2
         tilt = math.degrees(math.sqrt(float(squares.mean()) / 2))  # along each axis

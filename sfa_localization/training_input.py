@@ -88,7 +88,7 @@ class TrainingInput:
         runs = without_hidden(runs, sphere)
         seen, lean = runs[0].seen, camera_lean(runs, sphere)
         if lean.any():
-            logger.warning('the camera %s: the model levels its images', leaning(*lean))
+            logger.warning('%s', leaning(*lean))
         runs = [upright_run(run, lean, sphere) for run in runs]
         total = sum(len(run.panoramas) for run in runs)
         with progress_bar(titled(2, 'level the images'), visible=progress) as bar:

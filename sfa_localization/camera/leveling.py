@@ -8,6 +8,7 @@ Panoramas are leveled by the orientation of an IMU, live and from bags, or else 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -27,11 +28,11 @@ correlation time of 0.7 s tilts by one degree meanwhile."""
 
 
 def leaning(roll: float, pitch: float) -> str:
-    """How a camera leans on the robot by roll and pitch, rad."""
+    """The sentence about a camera that leans on the robot by roll and pitch, rad."""
     aside, along = ('right' if roll > 0 else 'left'), ('forward' if pitch > 0 else 'back')
     return (
-        f'leans by {abs(np.degrees(roll)):.1f} degrees to the {aside} and by '
-        f'{abs(np.degrees(pitch)):.1f} degrees {along}'
+        f'the camera leans by {abs(np.degrees(roll)):.1f} degrees to the {aside} and by '
+        f'{abs(np.degrees(pitch)):.1f} degrees {along}: the model levels its images'
     )
 
 
@@ -57,7 +58,7 @@ def _rotated(panorama: Image, turn: Array, sphere: Sphere) -> Image:
 
 
 @dataclass(frozen=True, slots=True)
-class ChangedPanoramas:
+class ChangedPanoramas(ABC):
     """Panoramas that are changed as they are read."""
 
     stamps_ns: Stamps
@@ -77,8 +78,9 @@ class ChangedPanoramas:
         for k, images in enumerate(self.panoramas.batches(size)):
             yield self._changed(images, k * size)
 
+    @abstractmethod
     def _changed(self, images: Image, start: int) -> Image:
-        raise NotImplementedError
+        """The panoramas (N, H, W, 3) that begin with number `start`, changed."""
 
 
 @dataclass(frozen=True, slots=True)
