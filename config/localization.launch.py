@@ -85,7 +85,7 @@ def _nodes(context: LaunchContext) -> list:
     if panorama:
         seeing = [node('sfa_node', [('panorama', panorama)], {**model, **transport})]
     else:
-        seeing = [node('omnicam_node', images, transport), node('sfa_node', [], model)]
+        seeing = [node('omnicam_node', images, {**model, **transport}), node('sfa_node', [], model)]
     ekf = node('ekf_node', odometry, {}, condition=IfCondition(given['ekf']))
     return [PushROSNamespace(given['namespace']), *seeing, ekf, _rviz(given)]
 

@@ -65,7 +65,16 @@ def load_settings(path: Path | str, section: str, kind: type[S]) -> S:
     parameters = load_section(Path(path), section)
     names = {item.name for item in dataclasses.fields(kind)}
     chosen = {name: value for name, value in parameters.items() if name in names}
-    return kind.from_mapping(chosen, f'{path}: {section}')
+    return resolved_beside(kind.from_mapping(chosen, f'{path}: {section}'), path)
+
+
+def resolved_beside(settings: S, path: Path | str) -> S:
+    """Settings of a parameter file, whose relative calibration_file lies beside it."""
+    if not isinstance(settings, CameraConfig) or not settings.calibration_file:
+        return settings
+    return dataclasses.replace(
+        settings, calibration_file=str(Path(path).parent / settings.calibration_file)
+    )
 
 
 def load_section(path: Path, section: str) -> dict[str, Any]:

@@ -123,7 +123,7 @@ def evaluate(
     smoothed after the drive. Unusable images count as skipped observations. Raises BagError or
     DataError, also without ground truth.
     """
-    recipe = as_live(recipe or Recipe(), model.panorama, model.mount_rpy)
+    recipe = as_live(recipe or Recipe(), model.panorama, model.lens)
     recipe, drives = replace(recipe, origin=model.origin), list[_Located]()
     for path in align_bags:
         here = _with_topics_of(path, recipe)

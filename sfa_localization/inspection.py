@@ -19,18 +19,19 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from sfa_localization.bags import decoding
-from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S
+from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S, ReadingRecipe
+from sfa_localization.bags.lens_drive import lens_of
 from sfa_localization.bags.motion_arrays import to_yaw_rate
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.bags.topic_stream import Stream, clock_offset
-from sfa_localization.camera import body, kinds
+from sfa_localization.camera import body, kinds, lens_report
 from sfa_localization.camera.leveling import leaning
 from sfa_localization.camera.panorama import looks_like_panorama
-from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import FrozenWatch, frozen
-from sfa_localization.data.errors import BagError, MessageError
+from sfa_localization.data.errors import BagError, LocalizationError, MessageError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.messages import read_tilt, read_yaw_rate
@@ -148,9 +149,9 @@ class BagReport:
     `of_drive`, other drives may make up.
 
     `error` says why it cannot be read at all. `samples` are images from all over the drive, and
-    `camera` the kind of camera that they show. `drives` are the poses (M, 3) of images with
-    `odometry` in each unbroken part of it; `motion` compares odometry, images and gyroscope; `tilt`
-    is that of the ground.
+    `camera` the kind of camera that they show, `lens` a sentence about its lens. `drives` are the
+    poses (M, 3) of images with `odometry` in each unbroken part of it; `motion` compares odometry,
+    images and gyroscope; `tilt` is that of the ground.
     """
 
     path: str
@@ -162,6 +163,7 @@ class BagReport:
     of_drive: list[str] = field(default_factory=list)
     image_topic: str = ''
     camera: kinds.CameraKind | None = None
+    lens: str = ''
     samples: list[Image] = field(default_factory=list)
     odometry_topic: str = ''
     odometry: Odometry | None = None
@@ -180,6 +182,8 @@ class BagReport:
         facts = {}
         if self.camera is not None:
             facts['images'] = str(self.camera)
+        if self.lens:
+            facts['lens'] = self.lens
         if self.odometry is not None:
             area = max(map(hull_area, self.drives), default=0.0)
             along = max(map(directions, self.drives), default=0)
@@ -224,9 +228,6 @@ class BagReport:
         lines += [f'  {line}' for line in self.motion.as_text()] if self.motion else []
         lines += [f'  problem: {problem}' for problem in self.problems]
         lines += [f'  note: {note}' for note in self.notes]
-        if entry := self.camera.entry(self.path) if self.camera else '':
-            lines += ['  start my_localization.yaml with:', '    /**/omnicam_node:']
-            lines += ['      ros__parameters:', f'        {entry}']
         lines += [f'  not enough to train on: {lack}' for lack in self.lacks]
         return '\n'.join(lines if self.lacks else [*lines, '  enough to train on'])
 
@@ -239,8 +240,10 @@ def inspect(
     config: InspectionConfig | None = None,
     clockwise: bool = True,
     strict: bool = False,
+    camera: CameraConfig | None = None,
 ) -> BagReport:
-    """Read a bag once and report on it. Columns of panoramas grow `clockwise` seen from above.
+    """Read a bag and report on it. Columns of panoramas grow `clockwise` seen from above. Of other
+    images the lens is learned, and compared with that which the `camera` describes.
 
     Raises BagError when nothing in it can be read.
     """
@@ -252,6 +255,7 @@ def inspect(
         _Survey(bag, report, topics, clockwise).fill()
         report.problems = bag.problems
         report.notes += bag.recording.notes
+    _see_lens(report, ReadingRecipe(topics, camera=camera or CameraConfig()))
     if path_length(report.places) >= MOVED_M:
         report.notes += [ROUTE] if is_route(report.places) else []
         report.notes += [] if headings_differ(report.places) else [NO_LEVER_ARM]
@@ -261,6 +265,26 @@ def inspect(
     report.of_drive = list(lacks_of_drives(report.drives, config))
     report.lacks = [*lacks(report, config), *report.of_drive]
     return report
+
+
+def _see_lens(report: BagReport, recipe: ReadingRecipe) -> None:
+    """Fill in the lens that the drive shows, or what is missing to see it."""
+    if report.camera is None or report.camera.lack or report.odometry is None:
+        return
+    try:
+        lens = lens_of(Path(report.path), recipe)
+    except LocalizationError as error:
+        lacks = [] if recipe.camera.is_described else [str(error)]
+        report.lacks += [lack.removeprefix(f'{report.path}: ') for lack in lacks]
+        return
+    if lens is None:
+        return
+    report.lens = lens_report.sentence(lens)
+    report.notes += lens_report.advice(lens)
+    if recipe.camera.is_described:
+        report.notes += lens_report.contradictions(
+            lens, recipe.unwrapper.calibration, recipe.camera.name
+        )
 
 
 def _topic_of(bag: Bag, kind: str, name: str, report: BagReport) -> str:
@@ -300,7 +324,7 @@ class _Survey:
         if samples:
             ((height, width), _), *_ = self._sizes.most_common(1)
             alike = [sample for sample in samples if sample.shape == samples[0].shape]
-            report.camera = kinds.CameraKind(*kinds.guess_geometry(alike), width, height)
+            report.camera = kinds.CameraKind(*kinds.guess_geometry(alike)[:2], width, height)
         odometry = streams[self._odometry] if self._odometry else None
         if odometry is None or not self._values[self._odometry]:
             return

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from sfa_localization.camera.leveling import leveled
 from sfa_localization.camera.panorama import filled
-from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.data.array_files import Arrays, read_arrays, write_arrays
+from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
+from sfa_localization.data.array_files import Arrays, read_arrays, read_header, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.data.errors import LocalizationError, ModelError
+from sfa_localization.data.errors import ConfigError, LocalizationError, ModelError
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.rig import Rig
@@ -50,7 +50,8 @@ from sfa_localization.sfa.network import (
 )
 
 FORMAT = 'sfa_localization place model'
-VERSION = 16
+VERSION = 17
+_REMEDY = 'train it with the train command'
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +73,9 @@ class PlaceModel:
     of merit of the training, `error_correlation` that of neighboring images, `rig` the robot, and
     `ground` where it drove. Map and keyframes hold places of the camera. The map reads `turned`
     maps, or slow features where there are none. Where the robot hides its view, pixels (H, W)
-    repeat those of `repeated`. `mount_rpy`, degrees, are the angles of a camera that gives
-    panoramas, by which these were resampled; `lean`, rad, are roll and pitch of the camera then,
-    which images show; () if there are none.
+    repeat those of `repeated`. `lens` is that of the camera, with its mounting, or None for
+    panoramas that were used as they are; `lean`, rad, are roll and pitch of the camera then, which
+    images show; () if there are none.
     """
 
     network: Network
@@ -87,7 +88,7 @@ class PlaceModel:
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
     rig: Rig = field(default_factory=Rig)
     repeated: Indices | None = None
-    mount_rpy: tuple[float, ...] = ()
+    lens: LensCalibration | None = None
     lean: tuple[float, ...] = ()
 
     def locate(self, panorama: Image) -> Observation:
@@ -170,7 +171,7 @@ class PlaceModel:
     def load(cls, path: Path | str) -> PlaceModel:
         """Read a model. Raises ModelError when it is missing, damaged or of another version."""
         path = Path(path)
-        arrays = read_arrays(path, FORMAT, VERSION, 'train it with the train command')
+        arrays = read_arrays(path, FORMAT, VERSION, _REMEDY)
         try:
             model = cls._from_arrays(arrays, json.loads(str(arrays['header'])))
             model._prove()
@@ -211,7 +212,7 @@ class PlaceModel:
             'quality': self.quality,
             'error_correlation': dataclasses.asdict(self.error_correlation),
             'rig': self.rig.to_mapping(),
-            'mount_rpy': self.mount_rpy,
+            'lens': None if self.lens is None else dataclasses.asdict(self.lens),
             'lean': self.lean,
         }
 
@@ -244,9 +245,24 @@ class PlaceModel:
             ErrorCorrelation(**header['error_correlation']),
             Rig.from_mapping(header['rig']),
             arrays.get('repeated'),
-            tuple(header.get('mount_rpy', ())),
+            lens_from(header),
             tuple(header.get('lean', ())),
         )
+
+
+def camera_of(path: Path | str) -> tuple[PanoramaConfig, LensCalibration | None]:
+    """Panorama and lens of a model, without reading the rest. Raises ModelError."""
+    header = read_header(Path(path), FORMAT, VERSION, _REMEDY)
+    try:
+        return PanoramaConfig.from_mapping(header['panorama'], 'panorama'), lens_from(header)
+    except (ConfigError, KeyError, TypeError) as error:
+        raise _damaged(Path(path), str(error)) from None
+
+
+def lens_from(header: Mapping[str, Any]) -> LensCalibration | None:
+    """The lens in a model file's header. Raises ConfigError."""
+    lens = header['lens']
+    return None if lens is None else LensCalibration.from_mapping(lens, 'lens')
 
 
 def require_panorama(image: object) -> None:

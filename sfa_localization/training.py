@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 
 from sfa_localization.bags.drives import image_folder, read_drives
-from sfa_localization.camera.panorama import Unwrapper, repeated_pixels
+from sfa_localization.camera.learned_lens import LearnedLens
+from sfa_localization.camera.panorama import repeated_pixels
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
@@ -41,7 +42,12 @@ from sfa_localization.sfa.image_features import ImageFeatures, features_of_runs
 from sfa_localization.sfa.network import Network
 from sfa_localization.training_input import STEPS as STEPS
 from sfa_localization.training_input import Recipe as Recipe
-from sfa_localization.training_input import TrainingInput, compared, train_hierarchy
+from sfa_localization.training_input import (
+    TrainingInput,
+    compared,
+    train_hierarchy,
+    with_lens,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +55,8 @@ class Trained:
     """The model and the intermediate results of its training, for reports.
 
     `features` (N, K) are those of all images, drive after drive; `metric` belongs to the model's
-    map; `checks` hold the comparison of the sources of motion of each drive.
+    map; `checks` hold the comparison of the sources of motion of each drive; `lens` is what they
+    show of the camera, None for panoramas.
     """
 
     model: PlaceModel
@@ -58,6 +65,7 @@ class Trained:
     segments: Segments
     metric: MetricResult
     checks: tuple[MotionCheck, ...] = ()
+    lens: LearnedLens | None = None
 
 
 @one_core()
@@ -80,19 +88,20 @@ def train(
     """
     recipe, output = recipe or Recipe(), Path(output)
     cache = image_folder(output)
+    recipe, lens = with_lens(bags, recipe, progress)
     runs = read_drives(bags, cache, recipe, progress, strict=strict)  # step 1
     runs, checks = compared(runs, recipe, force)
-    settings = (recipe.network, recipe.architecture, recipe.panorama, recipe.camera)
+    settings = (recipe.network, recipe.architecture, recipe.panorama, recipe.camera, recipe.lens)
     checkpoint = Checkpoint.beside(output, settings, runs)
     if not resume:
         checkpoint.remove()
-    given = TrainingInput.of(runs, recipe, progress)  # step 2
+    given = TrainingInput.of(runs, recipe, progress, lens)  # step 2
     network = train_hierarchy(given, checkpoint)  # step 3
     trained = _learn(network, given, strict)  # steps 4 to 8
     compare_with_map(checks, given.drives, trained.metric)
     trained.model.save(output)
     checkpoint.remove()
-    return replace(trained, checks=checks)
+    return replace(trained, checks=checks, lens=lens)
 
 
 def learn_place(
@@ -150,6 +159,6 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         rig,
         repeated=None if given.seen is None else repeated_pixels(given.seen),
         lean=tuple(given.lean.tolist()) if given.lean.any() else (),
-        mount_rpy=Unwrapper(given.recipe.camera, given.panorama).mount_rpy,
+        lens=replace(given.recipe, panorama=given.panorama).unwrapper.lens,
     )
     return Trained(model, given.runs, images.slow, segments, result)

@@ -7,17 +7,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from sfa_localization.bags.drives import ReadingRecipe
-from sfa_localization.camera import body
+from sfa_localization.bags.lens_drive import lens_of
+from sfa_localization.camera import body, lens_report
 from sfa_localization.camera.kinds import require_single_view
+from sfa_localization.camera.learned_lens import PLACE_STD_M, LearnedLens
 from sfa_localization.camera.leveling import MaskedPanoramas, leaning
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings, turns_and_textures
-from sfa_localization.data.errors import DataError
+from sfa_localization.data.errors import CameraError, DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array, Mask
 from sfa_localization.data.progress import announce, progress_bar
@@ -46,6 +49,7 @@ from sfa_localization.sfa.settings import NetworkConfig
 from sfa_localization.sfa.zero_time_edges import edges_between
 
 logger = logging.getLogger(__name__)
+R = TypeVar('R', bound=ReadingRecipe)
 
 FEWEST_SEEN = 0.7
 """Share of the view: with a quarter hidden one image errs by 0.13 m, with a half by 0.5 m."""
@@ -82,7 +86,13 @@ class TrainingInput:
     progress: bool = False
 
     @classmethod
-    def of(cls, runs: Sequence[Run], recipe: Recipe, progress: bool = False) -> TrainingInput:
+    def of(
+        cls,
+        runs: Sequence[Run],
+        recipe: Recipe,
+        progress: bool = False,
+        lens: LearnedLens | None = None,
+    ) -> TrainingInput:
         """Step 2: level the images, find loop closures, and with them calibrate the odometry."""
         sphere = recipe.panorama.sphere
         runs = without_hidden(runs, sphere)
@@ -103,7 +113,8 @@ class TrainingInput:
         lever_arm = next((run.camera for run in runs if run.camera is not None), None)  # by tf
         if recipe.metric.camera_xy:
             lever_arm = complex(*recipe.metric.camera_xy)
-        items, mount = tuple(map(drive_of, runs)), Mount.at(lever_arm)
+        items, tracked = tuple(map(drive_of, runs)), (lens.place, PLACE_STD_M) if lens else None
+        mount = replace(Mount.at(lever_arm), tracked=tracked)
         drives = Drives(items, closures, recipe.segments, points=points, mount=mount)
         drives = drives.measured(views, sphere)
         return cls(drives, views, recipe, seen, lean, progress)
@@ -167,6 +178,37 @@ def train_hierarchy(given: TrainingInput, checkpoint: Checkpoint) -> Network:
 def titled(step: int, text: str) -> str:
     """The title of a step, with its number."""
     return f'{text} (step {step} of {STEPS})'
+
+
+def with_lens(
+    bags: Sequence[Path], recipe: R, progress: bool = False
+) -> tuple[R, LearnedLens | None]:
+    """The recipe with the lens, and the elevations, that the first bag to show them shows.
+
+    A described lens stays, and is compared with that of the drive. Raises BagError, and CameraError
+    where no bag shows the lens of images that are no panoramas.
+    """
+    lens, problems = None, list[CameraError]()
+    for bag in bags:
+        try:
+            lens = lens_of(bag, recipe, progress)
+            break
+        except CameraError as error:
+            problems.append(error)
+    if recipe.camera.is_described:
+        told = recipe.unwrapper.calibration, recipe.camera.name
+        for text in [] if lens is None else lens_report.contradictions(lens, *told):
+            logger.warning('%s', text)
+        return recipe, lens
+    if lens is None and problems:
+        raise CameraError(f'{problems[0]}; or describe the camera by calibration_file')
+    if lens is None:
+        return recipe, None
+    logger.info('%s', lens_report.sentence(lens))
+    for text in lens_report.advice(lens):
+        logger.warning('%s', text)
+    panorama = lens_report.fitting_panorama(recipe.panorama, lens)
+    return replace(recipe, lens=lens.calibration, panorama=panorama), lens
 
 
 def compared(

@@ -103,7 +103,7 @@ def update(
 
     Raises BagError, DataError or ModelError; then no model is written.
     """
-    recipe, added = as_live(recipe or ReadingRecipe(), model.panorama, model.mount_rpy), []
+    recipe, added = as_live(recipe or ReadingRecipe(), model.panorama, model.lens), []
     cache = image_folder(Path(output))
     for bag in bags:
         run = read_drive(bag, cache, recipe, progress, strict=strict)

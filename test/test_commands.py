@@ -33,7 +33,7 @@ BASE = {
     'evaluate': '{data}/model.npz {data}/test',
     'play': '{data}/test --rate 1000 --wait 0',
     'inspect': '{data}/bag',
-    'calibrate': '{data}/mirror.png',
+    'calibrate': '{data}/mirror.png --calibration {data}/info.yaml',
     'filter': '{data}/odom.csv {data}/positions.csv --output {out}/poses.tum',
     'tune': '{data}/test --model {data}/model.npz --output {out}/out.yaml',
     'map': '{data}/model.npz --output {out}/garden.yaml',
@@ -47,8 +47,8 @@ BASE = {
     'train --force': '{data}/bag --output {out}/model.npz --config {data}/counterclockwise.yaml',
     'inspect --strict': '{data}/cut',
     'calibrate --image-topic': '{data}/bag',
-    'calibrate --field-of-view': '{data}/mirror.png --model fisheye',
-    'calibrate --mount-rpy': '{data}/mirror.png --check {out}/check.png',
+    'calibrate --odom-topic': '{data}/bag',
+    'calibrate --calibration': '{data}/mirror.png',
 }
 CASES = {
     'simulate': """
@@ -79,10 +79,9 @@ CASES = {
         --odom-topic /ground_truth => by /ground_truth; --max-spacing 0.1; --reach 0.2
         --min-pictures 9999 => drive until there are 9999""",
     'calibrate': """
-        --image-topic /nothing => /nothing; --calibration {data}/info.yaml => fisheye
-        --center 300x200 => cx: 300; --radii 50x180 => radius_min: 50; --output {out}/camera.yaml
-        --check {out}/check.png; --model fisheye => fisheye; --field-of-view 150
-        --angle-min 70 => angle_min: 70; --angle-max 100 => angle_max: 100; --axis up => axis: up
+        --image-topic /nothing => /nothing; --odom-topic /nothing => /nothing
+        --calibration {data}/info.yaml => fisheye; --radii 50x180 => radius_min: 50
+        --output {out}/camera.yaml; --check {out}/check.png; --axis up => axis: up
         --mirrored no => mirrored: 'no'; --mount-rpy 0x0x90""",
     'filter': '--config {data}/start.yaml; --output {out}/other.tum',
     'tune': """

@@ -95,8 +95,8 @@ def test_frame_and_quality_of_service_by_parameter(bench, tmp_path):
     np.testing.assert_array_equal(pixels(panorama), Unwrapper(MIRROR, PANORAMA)(raw_picture()))
     bench.end(bench.nodes[0])
     path, turned = tmp_path / 'camera.yaml', (0.0, 0.0, 40.0)
-    path.write_text(calibration_text(LensCalibration(), turned))
-    given = {'calibration_file': str(path), 'mount_rpy': list(turned), 'camera_model': ''}
+    path.write_text(calibration_text(LensCalibration(mount_rpy=turned)))
+    given = {'calibration_file': str(path), 'camera_model': ''}
     node, heard = start(bench, frame_id='mast', **given)
     panorama = answer(bench, heard, message())
     assert panorama.header.frame_id == 'mast'

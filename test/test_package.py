@@ -55,7 +55,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'updating': (CORE - {'metric'} | {'place_model', 'observer', 'localizer'}, NUMERIC),
     'inspection': (CORE - {'sfa'}, NUMERIC | {'cv2'}),
     'filtering': ({'data', 'fusion'}, {'numpy'}),
-    'reports': ({'data', 'metric', 'training', 'inspection'}, {'numpy', 'matplotlib'}),
+    'reports': ({'data', 'camera', 'metric', 'training', 'inspection'}, {'numpy', 'matplotlib'}),
     'nodes': (
         {'data', 'camera', 'fusion', 'metric', 'place_model', 'observer', 'config'},
         {'numpy', 'yaml', 'nav2_msgs'} | ROS,  # nav2_msgs where it is installed

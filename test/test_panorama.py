@@ -172,7 +172,7 @@ def test_wrong_masks_and_pictures_are_refused():
         (mirror(blind_sectors=(0.0,)), good, 'a start and an end'),
         (mirror(mask_file='nowhere.png'), good, r'missing or is no image \(nowhere.png'),
         *((mirror(blind_sectors=sector), good, 'sees no part') for sector in whole),
-        (CameraConfig(), good, 'no camera is described: in the parameter file set'),
+        (CameraConfig(), good, 'no camera is described: set the parameter model'),
         *((mirror(), wrong, '') for wrong in (
             good[..., 0], good.astype(np.float32), good[:0], np.zeros((480, 640, 3), np.uint8)
         )),
@@ -194,7 +194,7 @@ def test_a_panorama_that_the_camera_gives_is_mounted_and_masked(model, clockwise
         unwrapper = Unwrapper(config, panorama)
         seen = unwrapper.visible(size)
         assert 0.7 < seen.mean() < 1.0 and (unwrapper.seen(size) == seen).all()
-        assert unwrapper.mount_rpy == mount
+        assert unwrapper.lens.mount_rpy == mount
         tilted = picture_of(smooth, lens, size, mount)[:, order]
         assert psnr(unwrapper(tilted)[seen], direct(smooth, panorama)[seen]) > 30
         level = picture_of(smooth, lens, size)[:, order]
@@ -211,7 +211,8 @@ def test_a_panorama_that_the_camera_gives_is_mounted_and_masked(model, clockwise
             again = filled(result[None], repeated_pixels(unwrapper.seen(size)))
             np.testing.assert_array_equal(again[0], result)
     untouched = Unwrapper(CameraConfig(camera_model=model), panorama)
-    assert untouched.seen(size) is None and untouched.mount_rpy == ()
+    assert untouched.seen(size) is None
+    assert not any(untouched.lens.mount_rpy) if model else untouched.lens is None
 
 
 def test_recorded_panoramas_are_mounted_and_masked_in_their_size(tmp_path):
@@ -235,7 +236,8 @@ def test_recorded_panoramas_are_mounted_and_masked_in_their_size(tmp_path):
         np.testing.assert_array_equal(run.panoramas.read(0, 1)[0], expected)
         assert 40 <= (~run.seen[0]).sum() <= 41 and (run.seen == run.seen[0]).all()
         missing = ReadingRecipe(camera=CameraConfig(mask_file='nowhere.png'))
-        learned = as_live(ReadingRecipe(), PanoramaConfig(), camera.mount_rpy)
-        assert learned.camera.mount_rpy == camera.mount_rpy
+        lens = Unwrapper(camera, panorama).lens
+        live = as_live(ReadingRecipe(), panorama, lens).unwrapper
+        assert live.lens == lens and lens.mount_rpy == camera.mount_rpy
         with pytest.raises(CameraError, match=r'mask_file is missing or is no image \(nowhere.png'):
             read_drive(tmp_path / name, tmp_path, missing)

@@ -24,7 +24,7 @@ from sfa_localization.bags.static_transforms import lever_arm
 from sfa_localization.bags.topic_stream import Stream, clock_offset
 from sfa_localization.camera.leveling import LeveledPanoramas, tilts_at
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama
-from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 from sfa_localization.camera.watch import FrozenWatch, frozen
 from sfa_localization.data.errors import BagError, DataError, MessageError, ModelError
 from sfa_localization.data.files import replaced_mode
@@ -51,7 +51,8 @@ class ReadingRecipe:
 
     Images farther than `odometry_tolerance_s` from odometry are left out (0: images before or after
     all of it), and with `distinct` also repetitions of the previous image. Fixes of a satellite
-    receiver count from the `origin`, or the first fix without one.
+    receiver count from the `origin`, or the first fix without one. Images are those of the `lens`,
+    where the camera describes no other.
     """
 
     topics: TopicNames = field(default_factory=TopicNames)
@@ -61,16 +62,21 @@ class ReadingRecipe:
     odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S
     distinct: bool = False
     origin: Origin | None = None
+    lens: LensCalibration | None = None
+
+    @property
+    def unwrapper(self) -> Unwrapper:
+        """Makes panoramas of images of the camera."""
+        lens = None if self.camera.is_described else self.lens
+        return Unwrapper(self.camera, self.panorama, lens)
 
 
-def as_live(recipe: R, panorama: PanoramaConfig, mount_rpy: tuple[float, ...] = ()) -> R:
-    """The recipe to read a drive with a model's panorama, as the nodes do: the filter also fuses
-    images far from any odometry. Without angles of a mount in the recipe, `mount_rpy` is used.
+def as_live(recipe: R, panorama: PanoramaConfig, lens: LensCalibration | None = None) -> R:
+    """The recipe to read a drive with a model's panorama and lens, as the nodes do: the filter also
+    fuses images far from any odometry.
     """
-    topics, camera = replace(recipe.topics, points_topic=''), recipe.camera
-    if mount_rpy and not any(camera.mount_rpy):
-        camera = replace(camera, mount_rpy=mount_rpy)
-    live = replace(recipe, topics=topics, camera=camera, panorama=panorama)
+    topics = replace(recipe.topics, points_topic='')
+    live = replace(recipe, topics=topics, panorama=panorama, lens=lens)
     return replace(live, odometry_tolerance_s=0.0)
 
 
@@ -199,7 +205,7 @@ class _PanoramaFile:
     def __init__(self, folder: Path, recipe: ReadingRecipe, is_ready: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as the run
-        self._unwrap = Unwrapper(recipe.camera, recipe.panorama)
+        self._unwrap = recipe.unwrapper
         self._unwrap.check()
         if is_ready:
             masked = CameraConfig(blind_sectors=recipe.camera.blind_sectors)

@@ -127,9 +127,21 @@ class Bag:
         has = listed(names) or 'no topics'
         return f'it has {has}: record one, or name one with {wanted.flag}'
 
-    def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
-        """Stamps and images (H, W, 3) BGR, one at a time."""
-        return self._values(self.stream(self.find('image', topic), lambda image: image))
+    def images(
+        self, topic: str = '', wanted: Callable[[int], bool] = lambda stamp_ns: True
+    ) -> Iterator[tuple[int, Image]]:
+        """Stamps and images (H, W, 3) BGR, one at a time, of the `wanted` stamps: of others, only
+        those of videos are decoded.
+        """
+        stream = self.stream(self.find('image', topic), lambda image: image)
+        stream.wanted = wanted
+        return ((at, image) for at, image in self._values(stream) if wanted(at))
+
+    def stamps(self, topic: str) -> Stream:
+        """The images of a topic, to be read without decoding them."""
+        stream = self.stream(topic, lambda message: None)
+        stream.images = None
+        return stream
 
     def trajectory(self, topic: str = '') -> Trajectory:
         """All poses of a topic, by default of the true poses."""
@@ -205,7 +217,8 @@ class Bag:
             stamp_ns = receive_ns if header is None else read_stamp(header.stamp)
             if stream.images is None:
                 return [(stamp_ns, part)]
-            return stream.images.add(stamp_ns, part)
+            is_video = topic.kind in decoding.VIDEOS
+            return stream.images.add(stamp_ns, part) if is_video or stream.wanted(stamp_ns) else []
         except BagError:
             raise
         except LocalizationError as error:

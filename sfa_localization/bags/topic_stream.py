@@ -46,9 +46,9 @@ class Item(NamedTuple):
 class Stream:
     """One topic being read, with the number of used messages, and of skipped ones by reason.
 
-    `convert` makes a value of a message, of its transform to `frame`, or of an image that
-    `images` reads. Messages of an opaque stream are not decoded: their value is None. `strict`
-    raises for a faulty message; a `required` stream must have a usable message.
+    `convert` makes a value of a message, of its transform to `frame`, or of an image of a `wanted`
+    stamp that `images` reads. Messages of an opaque stream are not decoded: their value is None.
+    `strict` raises for a faulty message; a `required` stream must have a usable message.
 
     Messages pass in increasing order of stamp, each when the next one has come. A single stamp that
     is ahead of the next is skipped, as is a jump that the next does not continue; a lasting jump is
@@ -61,6 +61,7 @@ class Stream:
     strict: bool
     frame: str | None = None
     images: ImageReader | None = None
+    wanted: Callable[[int], bool] = lambda stamp_ns: True
     required: bool = True
     opaque: bool = False
     received: int = 0

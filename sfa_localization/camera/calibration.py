@@ -17,10 +17,9 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from sfa_localization.camera.calibration_files import CALIBRATION_TITLE, read_calibration
-from sfa_localization.camera.encodings import read_image
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper, panorama_rays
-from sfa_localization.camera.settings import CalibrationConfig, LensCalibration
+from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.files import first_bytes
 from sfa_localization.data.geometry import Array, Complex, Mask
@@ -36,7 +35,6 @@ _ENOUGH_FOR_MOTION = 3  # images; the change between two is mostly noise
 _BESIDE = np.array([0.03, 0.06, 0.09])  # samples on both sides of a circle, over its radius
 _CONTRAST = 0.06  # of the range of a cue: more than its noise, less than a dim scene at the rim
 _RIM_SUPPORT, _HOLE_SUPPORT = 0.3, 0.6  # the border may cut off a rim, but no hole
-_CIRCLE = 'cx', 'cy', 'radius_min', 'radius_max'
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,19 +58,6 @@ class MirrorCircles:
     hole: Circle | None
 
 
-class ImageFiles(Sequence[Image]):
-    """Image files, each read on access: some kB may hold 200 MB of pixels."""
-
-    def __init__(self, paths: Sequence[Path]) -> None:
-        self._paths = paths
-
-    def __len__(self) -> int:
-        return len(self._paths)
-
-    def __getitem__(self, index: Any) -> Any:
-        return read_image(self._paths[index])
-
-
 def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
     """Find the rim of the mirror, and its hole, in images (H, W, 3) of one size.
 
@@ -93,8 +78,7 @@ def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
         few = len(images) < _ENOUGH_FOR_MOTION
         more = f'{_ENOUGH_FOR_MOTION} or more, not {len(images)}' if few else 'others'
         raise CameraError(
-            f'no mirror or fisheye stands out: take images ({more}) while driving in good light, '
-            'or give --center and --radii'
+            f'no mirror or fisheye stands out: take images ({more}) while driving in good light'
         )
     hole = clearest(rim)
     return MirrorCircles(_enlarged(rim, scale), hole and _enlarged(hole, scale))
@@ -255,78 +239,41 @@ def _inliers(points: Array, circle: Array) -> Mask:
     return np.asarray(np.abs(off) < _TOLERANCE * circle[2])
 
 
-def calibrate(
-    images: Sequence[Image],
-    calibration_file: Path | None,
-    config: CalibrationConfig,
-    given: Mapping[str, Any],
-) -> LensCalibration:
-    """The lens from a calibration file, or from the circle in images (H, W, 3).
-
-    `given` holds fields of LensCalibration that take precedence; a circle in it replaces that of
-    the images, and radii in it limit the visible part of a lens from a file. Raises CameraError.
+def described(calibration_file: Path, given: Mapping[str, Any]) -> LensCalibration:
+    """The lens in a calibration file, with the fields of LensCalibration that are `given` instead.
+    Raises CameraError.
     """
-    if calibration_file is not None:
-        used = {name: value for name, value in given.items() if name not in _CIRCLE[:2]}
-        return dataclasses.replace(read_calibration(calibration_file), **used)
-    if not images:
-        raise CameraError('give images of the camera, or --calibration')
-    height, width = images[0].shape[:2]
-    fields = {'camera_model': config.model, 'image_width': width, 'image_height': height}
-    if not given.keys() >= set(_CIRCLE):
-        circles = find_circles(images)
-        rim, hole = circles.rim, circles.hole.radius if circles.hole else 0.0
-        fields |= dict(zip(_CIRCLE, (rim.column, rim.row, hole, rim.radius), strict=True))
-    fields |= given
-    if config.model == 'fisheye':
-        focal = float(fields['radius_max'] / np.radians(config.field_of_view / 2))
-        fields |= {'fx': focal, 'fy': focal, 'radius_min': 0.0}
-    elif fields['radius_min'] == 0.0:
-        raise CameraError(
-            'no inner circle was found, which the polar model needs: give --center and --radii'
-        )
-    lens = LensCalibration.from_mapping(fields, 'calibration')
-    farthest = math.hypot(max(lens.cx, width - lens.cx), max(lens.cy, height - lens.cy))
-    if not (0 <= lens.cx <= width and 0 <= lens.cy <= height and lens.radius_max <= farthest):
-        raise CameraError(
-            f'a center at {lens.cx:g}x{lens.cy:g} with a rim of {lens.radius_max:g} pixels is not '
-            f'in an image of {width}x{height} pixels: correct --center or --radii'
-        )
-    return lens
+    return dataclasses.replace(read_calibration(calibration_file), **given)
 
 
-def given_circle(center: Sequence[float] | None, radii: Sequence[float] | None) -> dict[str, Any]:
-    """Fields of a lens from its center (column, row) and radii (hole, rim) in pixels, where they
-    are given. Raises CameraError.
-    """
-    valid = len(center or (0, 0)) == 2 and len(radii or (0, 0)) == 2
-    if not valid or (radii and not 0 <= radii[0] < radii[1]):
-        raise CameraError('--center takes COLUMNxROW, --radii takes INNERxOUTER in pixels')
-    fields = dict(zip(_CIRCLE[:2], center or (), strict=False))
-    return fields | dict(zip(_CIRCLE[2:], radii or (), strict=False))
+def given_radii(radii: Sequence[float] | None) -> dict[str, Any]:
+    """Fields of a lens from its radii (hole, rim) in pixels, if given. Raises CameraError."""
+    if radii is not None and (len(radii) != 2 or not 0 <= radii[0] < radii[1]):
+        raise CameraError('--radii takes INNERxOUTER in pixels')
+    return dict(zip(('radius_min', 'radius_max'), radii or (), strict=False))
 
 
-_GREEN, _RED = (80, 220, 80), (60, 60, 255)
+_GREEN, _RED, _YELLOW = (80, 220, 80), (60, 60, 255), (60, 230, 250)
 _CHECK_WIDTH = 1200  # px: the labels of a panorama of this width can be read
 _SIDES = {'FRONT': 0, 'LEFT': 90, 'BACK': 180, 'RIGHT': 270}
+_LOWEST_LABEL = -20  # degrees: lower ones would cover each other in a mirror
 _LABELS_DEG = 45  # azimuth of the labels of elevations
 _STEP, _NEAR = 4, 0.999  # step of the search for the pixel of a label, px; its least cosine
 
 
 def check_image(image: Image, unwrapper: Unwrapper) -> Image:
     """The raw image above its panorama, 1200 px wide, both with the front, left, back and right
-    in red, and elevations every ten degrees in green.
+    in red, elevations every ten degrees in green, and the edges of the panorama in yellow.
     """
     strip = _resized(unwrapper(image), _CHECK_WIDTH)
-    _draw(strip, _resized(panorama_rays(unwrapper.panorama), _CHECK_WIDTH))
+    _draw(strip, _resized(panorama_rays(unwrapper.panorama), _CHECK_WIDTH), unwrapper.panorama)
     raw = _resized(image, min(image.shape[1], _CHECK_WIDTH))
     height, width = raw.shape[:2]
-    camera = unwrapper.camera
-    model = make_camera(
-        unwrapper.calibration, (height, width), unwrapper.panorama, camera.mount_rpy
-    )
+    lens = unwrapper.calibration
+    model = make_camera(lens, (height, width), unwrapper.panorama, lens.mount_rpy)
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(float)
-    _draw(raw, model.unproject(pixels.reshape(-1, 2)).reshape(height, width, 3))
+    rays = model.unproject(pixels.reshape(-1, 2)).reshape(height, width, 3)
+    _draw(raw, rays, unwrapper.panorama)
     margin = (_CHECK_WIDTH - width) // 2
     framed = np.zeros((height + len(strip), _CHECK_WIDTH, 3), np.uint8)
     framed[:height, margin : margin + width], framed[height:] = raw, strip
@@ -340,19 +287,24 @@ def _resized(image: Any, width: int) -> Any:
     return cv2.resize(image, (width, height), interpolation=method)
 
 
-def _draw(canvas: Image, rays: Array) -> None:
-    """Draw directions and elevations into an image whose pixels see the rays (H, W, 3)."""
+def _draw(canvas: Image, rays: Array, panorama: PanoramaConfig) -> None:
+    """Draw directions, elevations, and the edges of the panorama into an image whose pixels see the
+    rays (H, W, 3).
+    """
     x, y, z = np.moveaxis(np.nan_to_num(rays), -1, 0)
     square = np.ones((3, 3), np.uint8)
     visible = cv2.erode(np.isfinite(rays[..., 0]).astype(np.uint8), square) > 0
-    bands, quadrants = (
-        np.floor(np.degrees(np.arcsin(np.clip(z, -1, 1))) / 10),
-        2 * (x > 0) + (y > 0),
-    )
-    for regions, color in ((bands, _GREEN), (quadrants, _RED)):
+    elevations = np.degrees(np.arcsin(np.clip(z, -1, 1)))
+    inside = (elevations > panorama.elevation_min) & (elevations < panorama.elevation_max)
+    quadrants = 2 * (x > 0) + (y > 0)
+    for regions, color in (
+        (np.floor(elevations / 10), _GREEN),
+        (quadrants, _RED),
+        (inside, _YELLOW),
+    ):
         border = cv2.morphologyEx(regions.astype(np.int16), cv2.MORPH_GRADIENT, square[:2, :2])
         canvas[(border > 0) & visible] = color
-    for elevation in range(-80, 90, 10):
+    for elevation in range(_LOWEST_LABEL, 90, 10):
         name = f'{elevation:+d} deg' if elevation else 'HORIZON'
         _write(canvas, name, rays, (_LABELS_DEG, elevation), _GREEN)
     for name, azimuth in _SIDES.items():

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from sfa_localization.camera.settings import CameraConfig, LensCalibration
+from sfa_localization.camera.settings import NEEDS_CALIBRATION, CameraConfig, LensCalibration
 from sfa_localization.data.errors import CameraError, ConfigError
 from sfa_localization.data.files import read_regular
 from sfa_localization.data.plain_yaml import load_yaml
@@ -28,20 +28,30 @@ _SUPPORTED = (
     'XML, OCamCalib calib_results.txt, and what the command calibrate writes'
 )
 _OF_EVERY_CAMERA = ('camera_model', 'image_width', 'image_height', 'cx', 'cy', 'radius_min',
-                    'radius_max', 'axis', 'mirrored')  # fmt: skip
+                    'radius_max', 'axis', 'mirrored', 'mount_rpy')  # fmt: skip
 _OF_MODEL = {
     'mirror': ('fx', 'fy', 'xi', 'distortion'),
     'fisheye': ('fx', 'fy', 'distortion'),
     'ocam': ('polynomial', 'affine'),
     'polar': ('angle_min', 'angle_max'),
-    'dual_fisheye': ('fx', 'fy', 'distortion', 'second_cx', 'second_cy', 'second_roll'),
+    'dual_fisheye': (
+        'fx',
+        'fy',
+        'distortion',
+        'second_cx',
+        'second_cy',
+        'second_focal',
+        'second_distortion',
+        'second_roll',
+        'second_tilt',
+    ),
+    'equirectangular': ('elevation_min', 'elevation_max'),
 }
+_OPTIONAL = {'distortion', 'affine', 'second_focal', 'second_distortion', 'second_tilt'}
 _LARGEST_FILE = 1 << 20  # bytes: hundreds of times the largest calibration
 CALIBRATION_TITLE = '# Calibration of an omnidirectional camera'
 _HEAD = f"""\
-{CALIBRATION_TITLE}; parameters of omnicam_node that go with it:
-#   calibration_file: name of this file
-#   mount_rpy: {{mount_rpy}}
+{CALIBRATION_TITLE}; omnicam_node reads it by its parameter calibration_file.
 """
 
 # Names that programs give to the same things; the first in a file counts.
@@ -68,21 +78,20 @@ def calibration_of(camera: CameraConfig) -> LensCalibration:
         return read_calibration(Path(camera.calibration_file))
     if not camera.camera_model:
         raise CameraError(
-            'images are no panoramas, and no camera is described: in the parameter file set '
-            'calibration_file (see the command calibrate), or camera_model to equirectangular or '
-            'panorama, in the section /**/omnicam_node; or publish camera_info beside the images; '
-            'inspect prints what to write'
+            'images are no panoramas, and no camera is described: set the parameter model to the '
+            'model that was trained on images of this camera; or describe its lens by '
+            'calibration_file or camera_model, or by camera_info beside the images'
         )
     return LensCalibration(camera_model=camera.camera_model)
 
 
-def calibration_text(calibration: LensCalibration, mount_rpy: Sequence[float]) -> str:
+def calibration_text(calibration: LensCalibration) -> str:
     """The native calibration file (YAML): every field that the camera model uses."""
     names = _OF_EVERY_CAMERA + _OF_MODEL.get(calibration.camera_model, ())
     values = [getattr(calibration, name) for name in names]
     plain = [list(value) if isinstance(value, tuple) else value for value in values]
     fields = yaml.safe_dump(dict(zip(names, plain, strict=True)), sort_keys=False)
-    return _HEAD.format(mount_rpy=list(mount_rpy)) + str(fields)
+    return _HEAD + str(fields)
 
 
 def read_calibration(path: Path) -> LensCalibration:
@@ -152,8 +161,9 @@ def _from_names(text: str) -> dict[str, Any]:
     if 'camera_model' not in content or set(_MATRIX) & set(content):
         return _from_others(_flat(content))
     model = content['camera_model']
-    missing = [name for name in ('cx', 'cy', *_OF_MODEL.get(model, ())) if name not in content]
-    if missing and model in _OF_MODEL:
+    needed = ('cx', 'cy', *_OF_MODEL.get(model, ())) if model in NEEDS_CALIBRATION else ()
+    missing = [name for name in needed if name not in {*content, *_OPTIONAL}]
+    if missing:
         raise CameraError(f'{", ".join(missing)} missing, which the {model} model needs')
     LensCalibration.from_mapping(content, 'calibration')  # rejects unknown names
     return dict(content)

@@ -1,11 +1,12 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The kind of a camera, guessed from its images, and the parameters that describe it."""
+"""The kind of a camera, guessed from its images."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,16 +21,6 @@ from sfa_localization.data.statistics import evenly
 PANORAMA, EQUIRECTANGULAR, ORDINARY = 'panorama', 'equirectangular', 'ordinary camera'
 MIRROR, FISHEYE, DUAL_FISHEYE = 'mirror', 'fisheye', 'dual fisheye'
 STEREO = 'stereo pair'
-# Parameters of omnicam_node to start from; a strip needs none.
-_CALIBRATE = 'calibration_file: camera.yaml  # by: sfa_localization calibrate {bag}'
-_OUTPUTS = '--output camera.yaml --check check.png'
-_ENTRIES = {
-    MIRROR: f'{_CALIBRATE} {_OUTPUTS}',
-    FISHEYE: f'{_CALIBRATE} --model fisheye --field-of-view 185 {_OUTPUTS}',
-    DUAL_FISHEYE: 'calibration_file: camera.yaml  # with camera_model: dual_fisheye',
-    EQUIRECTANGULAR: 'camera_model: equirectangular',
-    PANORAMA: 'camera_model: panorama',
-}
 _RADII, _ANGLES, _INNER = 30, 400, 10  # of an unrolled circle; the inner third shows the robot
 # Views side by side correlate by 1, or 0.5 when shifted by parallax, up to a share of their width;
 # opposite parts of a panorama by 0.1.
@@ -69,33 +60,40 @@ class CameraKind:
             'is one, describe it with calibration_file)'
         )
 
-    def entry(self, bag: str) -> str:
-        """The parameter of omnicam_node that describes the camera of a bag; '' if none does."""
-        needed = self.name in _ENTRIES and not looks_like_panorama(self.height, self.width)
-        return _ENTRIES[self.name].format(bag=bag) if needed else ''
+
+class Geometry(NamedTuple):
+    """The name of a kind of camera, the evidence for it, and its circles."""
+
+    name: str
+    evidence: str
+    circles: tuple[MirrorCircles, ...] = ()
 
 
-def guess_geometry(samples: Sequence[Image]) -> tuple[str, str]:
-    """The name of the kind of camera of images (H, W, 3), and the evidence for it."""
+def guess_geometry(samples: Sequence[Image]) -> Geometry:
+    """The kind of camera of images (H, W, 3)."""
     height, width = samples[0].shape[:2]
     ratio, twice = f'{width / height:.1f} times as wide as high', abs(width / height - 2) < 0.02
     closes = width > height and _closes(samples)
-    halves = np.arange(2) * (width // 2)
     if not closes and _same_twice(samples):
-        return STEREO, 'the left half shows the same as the right one'
+        return Geometry(STEREO, 'the left half shows the same as the right one')
     if looks_like_panorama(height, width):
-        return PANORAMA, ratio
-    if twice and all(_circles([s[:, at : at + height] for s in samples]) for at in halves):
-        return DUAL_FISHEYE, 'two circles'
-    if circles := None if twice else _circles(samples):
-        if circles.hole is None:
-            return FISHEYE, 'a circle'
-        share = circles.hole.radius / circles.rim.radius
-        return MIRROR, f'a circle, and the camera itself in its middle, {share:.0%} as wide'
+        return Geometry(PANORAMA, ratio)
+    if twice:
+        starts = 0, width // 2
+        pair = [_circles([sample[:, at : at + height] for sample in samples]) for at in starts]
+        circles = tuple(circle for circle in pair if circle)
+        if len(circles) == 2:
+            return Geometry(DUAL_FISHEYE, 'two circles', circles)
+    elif circle := _circles(samples):
+        if circle.hole is None:
+            return Geometry(FISHEYE, 'a circle', (circle,))
+        share = circle.hole.radius / circle.rim.radius
+        evidence = f'a circle, and the camera itself in its middle, {share:.0%} as wide'
+        return Geometry(MIRROR, evidence, (circle,))
     if closes:
         kind = EQUIRECTANGULAR if twice else PANORAMA
-        return kind, f'{ratio}, whose right edge continues at the left'
-    return ORDINARY, 'no circle, and the edges do not continue at the other side'
+        return Geometry(kind, f'{ratio}, whose right edge continues at the left')
+    return Geometry(ORDINARY, 'no circle, and the edges do not continue at the other side')
 
 
 def require_single_view(runs: Sequence[Run]) -> None:

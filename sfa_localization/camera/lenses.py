@@ -18,7 +18,7 @@ from numpy.polynomial import Polynomial
 
 from sfa_localization.camera.settings import UNCALIBRATED, LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Mask
 from sfa_localization.data.sphere import Sphere, rotation
 
 _LEAST_AFFINE = 1e-3  # determinant of the affine part: 1 for square pixels, 0 if singular
@@ -166,16 +166,29 @@ class DualFisheyeLens:
     center: None = None
 
     def project(self, rays: Array) -> Array:
-        behind = rays[:, 2:] < 0.0
-        return np.where(behind, self.second.project(rays @ self.turn.T), self.first.project(rays))
+        """Each lens sees what lies ahead of it."""
+        return self.project_by(rays[:, 2] < 0.0, rays)
 
     def unproject(self, pixels: Array) -> Array:
-        first, second = self.first.unproject(pixels), self.second.unproject(pixels)
-        to_first = np.linalg.norm(pixels - self.first.center, axis=1)
-        to_second = np.linalg.norm(pixels - self.second.center, axis=1)
-        rays = np.where((to_second < to_first)[:, None], second @ self.turn, first)
-        ahead = np.where(to_second < to_first, second[:, 2], first[:, 2]) >= 0.0
+        by_second = self.by_second(pixels)
+        rays = self.unproject_by(by_second, pixels)
+        ahead = np.where(by_second, (rays @ self.turn.T)[:, 2], rays[:, 2]) >= 0.0
         return np.where(ahead[:, None], rays, np.nan)
+
+    def by_second(self, pixels: Array) -> Mask:
+        """Which pixels (N, 2) are nearer to the center of the second lens."""
+        to_first = np.linalg.norm(pixels - self.first.center, axis=1)
+        return np.asarray(np.linalg.norm(pixels - self.second.center, axis=1) < to_first)
+
+    def project_by(self, by_second: Mask, rays: Array) -> Array:
+        """Pixels (N, 2) of rays (N, 3) in the second lens, or in the first."""
+        second = self.second.project(rays @ self.turn.T)
+        return np.where(by_second[:, None], second, self.first.project(rays))
+
+    def unproject_by(self, by_second: Mask, pixels: Array) -> Array:
+        """Rays (N, 3) of pixels (N, 2) in the second lens, or in the first."""
+        second = self.second.unproject(pixels) @ self.turn
+        return np.where(by_second[:, None], second, self.first.unproject(pixels))
 
 
 Lens = RadialLens | CylinderLens | DualFisheyeLens
@@ -226,6 +239,7 @@ _AXES = {  # columns: directions of the image's right, bottom and center
     'up': np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
     'forward': np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
 }
+_BACK = np.diag([-1.0, -1.0, 1.0])  # the axes of a camera that looks back, x forward
 _USUAL_AXIS = {'mirror': 'down', 'polar': 'down', 'fisheye': 'up', 'ocam': 'up'}
 _ASPECT_TOLERANCE = 0.02  # between image and calibration, for rounded sizes
 
@@ -263,10 +277,10 @@ def _scale(calibration: LensCalibration, size: tuple[int, int]) -> Array:
     if abs(scale[0] / scale[1] - 1.0) > _ASPECT_TOLERANCE:
         raise CameraError(
             f'the image is {width} x {height} but the camera is calibrated for '
-            f'{calibrated[0]} x {calibrated[1]}, which is no scaling of it: name the '
-            'calibration_file of this camera, or, if the images were cropped to calibrate it, add '
-            'the columns and rows cut off at the left and top to its cx and cy, and set '
-            'image_width and image_height'
+            f'{calibrated[0]} x {calibrated[1]}, which is no scaling of it: set the camera to the '
+            'size of the training, or name the calibration_file of this camera, or, if the images '
+            'were cropped to calibrate it, add the columns and rows cut off at the left and top '
+            'to its cx and cy, and set image_width and image_height'
         )
     return scale
 
@@ -278,30 +292,45 @@ def _make_lens(
     if model == 'panorama':
         return CylinderLens(replace(panorama.sphere, clockwise=True), size)
     if model == 'equirectangular':
-        return CylinderLens(Sphere(-np.pi / 2, np.pi / 2), size)
+        edges = np.radians([calibration.elevation_min, calibration.elevation_max])
+        return CylinderLens(Sphere(*edges.tolist()), size)
     center = np.array([calibration.cx, calibration.cy])
     if model == 'polar':
         return RadialLens(center, np.ones(2), bend=_polar_bend(calibration))
     if model == 'ocam':
         return _ocam_lens(calibration, center, size)
     focal = np.array([calibration.fx, calibration.fy])
-    if len(calibration.distortion) not in (0, 4):
-        raise CameraError(
-            f'distortion has {len(calibration.distortion)} coefficients; give 4, or none'
-        )
-    k1, k2, k3, k4 = calibration.distortion or (0.0,) * 4
+    k1, k2, k3, k4 = _four(calibration.distortion)
     if model == 'mirror':
         curve = Polynomial([0.0, 1.0, 0.0, k1, 0.0, k2])
         bend = increasing(curve, curve.deriv(), _WIDEST_PLANE) if any((k1, k2, k3, k4)) else None
         return RadialLens(center, focal, calibration.xi, bend, (k3, k4))
+    fisheye = _fisheye_lens(center, focal, calibration.distortion)
+    return fisheye if model == 'fisheye' else DualFisheyeLens(fisheye, *_second(calibration))
+
+
+def _four(distortion: tuple[float, ...]) -> tuple[float, ...]:
+    if len(distortion) not in (0, 4):
+        raise CameraError(f'distortion has {len(distortion)} coefficients; give 4, or none')
+    return distortion or (0.0,) * 4
+
+
+def _fisheye_lens(center: Array, focal: Array, distortion: tuple[float, ...]) -> RadialLens:
+    """Model of J. Kannala and S. Brandt, PAMI 2006."""
+    k1, k2, k3, k4 = _four(distortion)
     curve = Polynomial([0.0, 1.0, 0.0, k1, 0.0, k2, 0.0, k3, 0.0, k4])
-    fisheye = RadialLens(center, focal, bend=increasing(curve, curve.deriv(), np.pi))
-    if model == 'fisheye':
-        return fisheye
-    second = np.array([calibration.second_cx, calibration.second_cy])
-    roll = rotation(0.0, 0.0, np.radians(calibration.second_roll))
-    turn = roll @ np.diag([-1.0, 1.0, -1.0])
-    return DualFisheyeLens(fisheye, replace(fisheye, center=second), turn)
+    return RadialLens(center, focal, bend=increasing(curve, curve.deriv(), np.pi))
+
+
+def _second(calibration: LensCalibration) -> tuple[RadialLens, Array]:
+    """The second lens of two, and the rotation (3, 3) of rays to its frame."""
+    center = np.array([calibration.second_cx, calibration.second_cy])
+    focal = np.array([calibration.fx, calibration.fy])
+    if calibration.second_focal:
+        focal = np.full(2, calibration.second_focal)
+    distortion = calibration.second_distortion or calibration.distortion
+    turn = rotation(*np.radians([calibration.second_roll, *calibration.second_tilt])) @ _BACK
+    return _fisheye_lens(center, focal, distortion), _AXES['forward'].T @ turn @ _AXES['forward']
 
 
 def _polar_bend(calibration: LensCalibration) -> Curve:

@@ -72,8 +72,11 @@ class Unwrapper:
 
     @cached_property
     def calibration(self) -> LensCalibration:
-        """The lens. Raises CameraError where none is described, or its file cannot be used."""
-        return self._calibration or calibration_of(self.camera)
+        """The lens and its mounting. Raises CameraError where none is described, or its file cannot
+        be used.
+        """
+        lens, mount_rpy = self._calibration or calibration_of(self.camera), self.camera.mount_rpy
+        return replace(lens, mount_rpy=mount_rpy) if any(mount_rpy) else lens
 
     @property
     def model(self) -> str:
@@ -127,10 +130,10 @@ class Unwrapper:
         return self.model != 'equirectangular' and looks_like_panorama(*size)
 
     @property
-    def mount_rpy(self) -> tuple[float, ...]:
-        """The angles by which panoramas of the camera are resampled, degrees; () for none."""
-        mount_rpy = self._of_panoramas()[0].mount_rpy
-        return mount_rpy if any(mount_rpy) else ()
+    def lens(self) -> LensCalibration | None:
+        """The lens, or that of panoramas which are mounted at an angle; None for neither."""
+        lens = self.calibration if self.model else self._of_panoramas()[1]
+        return lens if self.model or any(lens.mount_rpy) else None
 
     def keeping_size(self, size: tuple[int, int]) -> Unwrapper:
         """The same for panoramas of `size` (rows, columns), which keep it."""
@@ -164,8 +167,9 @@ class Unwrapper:
         # Their columns grow as declared.
         mirrored = 'no' if self.panorama.clockwise else 'yes'
         calibration = LensCalibration(camera_model='panorama', mirrored=mirrored)
-        masked = CameraConfig(blind_sectors=self.camera.blind_sectors)
-        return masked if self.model else self.camera, calibration
+        if self.model:
+            return CameraConfig(blind_sectors=self.camera.blind_sectors), calibration
+        return self.camera, replace(calibration, mount_rpy=self.camera.mount_rpy)
 
 
 def build_tables(
@@ -175,7 +179,7 @@ def build_tables(
     size: tuple[int, int],
 ) -> _Tables:
     """Build the lookup tables for images of `size` (rows, columns)."""
-    model = make_camera(calibration, size, panorama, camera.mount_rpy)
+    model = make_camera(calibration, size, panorama, calibration.mount_rpy)
     rays = panorama_rays(panorama)
     pixels = model.project(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
     visible = np.isfinite(pixels[..., 0])

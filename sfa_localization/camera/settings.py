@@ -46,6 +46,12 @@ class PanoramaConfig(Settings):
         low, high = math.radians(self.elevation_min), math.radians(self.elevation_max)
         return Sphere(low, high, self.clockwise)
 
+    def asked_differences(self, asked: PanoramaConfig) -> str:
+        """What differs in what is `asked` otherwise than by default."""
+        names = [item.name for item in dataclasses.fields(self)]
+        given = {n: v for n in names if (v := getattr(asked, n)) != getattr(PanoramaConfig(), n)}
+        return self.differences(dataclasses.replace(self, **given))
+
     def differences(self, other: PanoramaConfig) -> str:
         """What differs in `other`, as 'height 30 instead of 60'; '' when they are equal."""
         names = [item.name for item in dataclasses.fields(self)]
@@ -100,8 +106,8 @@ class CameraConfig(Settings):
     camera_model: str = setting(
         '',
         'camera without a calibration_file: mirror (that of the simulator), equirectangular, or '
-        'panorama (the image is a panorama already); empty: none, then images at least 3.5 times '
-        'as wide as high are used, as panoramas, and live those that camera_info describes',
+        'panorama (the image is a panorama already); empty: the lens that training has learned, '
+        'or that camera_info describes; images 3.5 times as wide as high are panoramas',
         choices=('', 'mirror', *UNCALIBRATED),
     )
     calibration_file: str = setting(
@@ -137,8 +143,23 @@ class CameraConfig(Settings):
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
-        if len(self.mount_rpy) != 3:
-            raise ConfigError('mount_rpy: give three angles: roll, pitch and yaw')
+        require_angles('mount_rpy', self.mount_rpy)
+
+    @property
+    def is_described(self) -> bool:
+        """Whether it names a lens."""
+        return bool(self.calibration_file or self.camera_model)
+
+    @property
+    def name(self) -> str:
+        """The described lens in words."""
+        return self.calibration_file.rpartition('/')[2] or f'camera_model {self.camera_model}'
+
+
+def require_angles(name: str, angles: tuple[float, ...]) -> None:
+    """Raise ConfigError unless there are three angles."""
+    if len(angles) != 3:
+        raise ConfigError(f'{name}: give three angles: roll, pitch and yaw')
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,8 +235,27 @@ class LensCalibration(Settings):
     second_cy: float = setting(
         0.0, 'dual_fisheye: row of the second center', unit='px', low=-1e5, high=1e5
     )
+    second_focal: float = setting(
+        0.0, 'dual_fisheye: focal length of the second; 0: fx', unit='px', low=0.0, high=1e5
+    )
+    second_distortion: tuple[float, ...] = setting(
+        (), 'dual_fisheye: distortion of the second; none: that of the first', low=-1e3, high=1e3
+    )
     second_roll: float = setting(
         0.0, 'dual_fisheye: rotation of the second image', unit='deg', low=-180.0, high=180.0
+    )
+    second_tilt: tuple[float, ...] = setting(
+        (0.0, 0.0),
+        'dual_fisheye: pitch and yaw of the second lens, against looking back from the first',
+        unit='deg',
+        low=-180.0,
+        high=180.0,
+    )
+    elevation_min: float = setting(
+        -90.0, 'equirectangular: elevation of the lower edge', unit='deg', low=-90.0, high=89.0
+    )
+    elevation_max: float = setting(
+        90.0, 'equirectangular: elevation of the upper edge', unit='deg', low=-89.0, high=90.0
     )
     axis: str = setting(
         'auto',
@@ -230,6 +270,19 @@ class LensCalibration(Settings):
         'mirror and polar',
         choices=('auto', 'yes', 'no'),
     )
+    mount_rpy: tuple[float, ...] = setting(
+        (0.0, 0.0, 0.0),
+        'roll, pitch and yaw of the camera on the robot, unless omnicam_node sets mount_rpy',
+        unit='deg',
+        low=-360.0,
+        high=360.0,
+    )
+
+    def __post_init__(self) -> None:
+        Settings.__post_init__(self)
+        require_angles('mount_rpy', self.mount_rpy)
+        if len(self.second_tilt) != 2:
+            raise ConfigError('second_tilt: give two angles: pitch and yaw')
 
     @property
     def is_mirrored(self) -> bool:
@@ -237,15 +290,3 @@ class LensCalibration(Settings):
         if self.mirrored == 'auto':
             return self.camera_model in ('mirror', 'polar')
         return self.mirrored == 'yes'
-
-
-@dataclass(frozen=True, slots=True)
-class CalibrationConfig(Settings):
-    """What the command `calibrate` cannot find in the images."""
-
-    model: str = setting(
-        'polar', 'camera model made from circles alone', choices=('polar', 'fisheye')
-    )
-    field_of_view: float = setting(
-        185.0, 'fisheye: field of view within the rim', unit='deg', low=10.0, high=360.0
-    )

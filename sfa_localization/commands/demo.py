@@ -37,7 +37,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demonstration; print the errors."""
-    from sfa_localization.camera.settings import CameraConfig
     from sfa_localization.commands.live_nodes import commands, run_live
     from sfa_localization.reports.evaluation import tables
     from sfa_localization.simulation.drive import simulate
@@ -56,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
         if not (out / drive).exists():
             simulate(replace(garden, trajectory=drive), out / drive, progress=True)
     announce('train on the first, without ground truth')
-    recipe = Recipe(camera=CameraConfig(camera_model='mirror'))
+    recipe = Recipe()
     trained = train([out / 'coverage'], out / 'model.npz', recipe, progress=True, resume=True)
     announce('run the three nodes live on the second')
     live = run_live(commands(out / 'model.npz', out / 'test'), out / 'logs')

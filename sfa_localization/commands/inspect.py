@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sfa_localization.bags.settings import TopicNames
-from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.commands import options
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.files import write_json
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--report', type=Path, metavar='DIR', help='write a contact sheet and the path as PNG'
     )
     parser.add_argument('--strict', action='store_true', help='reject damaged bags')
-    parser.add_argument('--config', type=Path, help='parameter file, for `clockwise`')
+    parser.add_argument('--config', type=Path, help='parameter file, for the camera')
     options.add_topics(parser, 'image', 'odometry', 'imu')
     options.add_settings(parser, InspectionConfig)
 
@@ -45,17 +45,18 @@ def run(arguments: argparse.Namespace) -> int:
     """Inspect all bags, each alone, also after an unreadable one, and all together."""
     topics = options.settings(TopicNames, arguments)
     config = options.settings(InspectionConfig, arguments)
-    clockwise = options.settings(PanoramaConfig, arguments).clockwise
-    strict = arguments.strict
+    reading = {
+        'clockwise': options.settings(PanoramaConfig, arguments).clockwise,
+        'camera': options.settings(CameraConfig, arguments),
+        'strict': arguments.strict,
+    }
     if arguments.json:
         options.require_output(arguments.json, arguments.bags, '.json')
     options.require_report(arguments.report, arguments.json)
     reports = []
     for path in arguments.bags:
         try:
-            reports.append(
-                inspect(path, topics=topics, config=config, clockwise=clockwise, strict=strict)
-            )
+            reports.append(inspect(path, topics=topics, config=config, **reading))
         except BagError as error:
             reports.append(BagReport(str(path), error=str(error)))
     lacks = lacks_together(reports, config)

@@ -169,8 +169,9 @@ def commands(model: Path, bag: Path) -> dict[str, list[str]]:
     """The command lines of the three nodes and of the player of `bag`, by name."""
     program = [sys.executable, '-m', 'sfa_localization']
     nodes = {name: [*program, name, '--ros-args'] for name in NODES}
-    nodes['omnicam_node'] += ['-p', 'image_transport:=compressed', '-p', 'camera_model:=mirror']
-    nodes['sfa_node'] += ['-p', f'model:={model}']
+    nodes['omnicam_node'] += ['-p', 'image_transport:=compressed']
+    for name in ('omnicam_node', 'sfa_node'):
+        nodes[name] += ['-p', f'model:={model}']
     return {**nodes, PLAYER: [*program, PLAYER, str(bag)]}
 
 

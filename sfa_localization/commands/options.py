@@ -157,7 +157,7 @@ def require_same_panorama(path: Path | None, trained: PanoramaConfig) -> None:
     declared = load_settings(path, 'omnicam_node', PanoramaConfig)
     # Recorded panoramas keep their size.
     declared = dataclasses.replace(declared, width=trained.width, height=trained.height)
-    differences = trained.differences(declared)
+    differences = trained.asked_differences(declared)
     if differences:
         raise ConfigError(
             f'{path}: omnicam_node: panoramas would differ from those of training: {differences}'

@@ -133,5 +133,21 @@ def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Re
     ]
     samples = {image: read[run][at] for image, (run, at) in worst.items() if at in read[run]}
     begin_page(folder)
-    write_training_report(folder, trained, samples)
+    write_training_report(folder, trained, samples, _lens_picture(bags[0], trained, used))
     print(f'{folder / PAGE}: written')
+
+
+def _lens_picture(bag: Path, trained: Trained, used: Recipe) -> bytes:
+    """An image with the lens drawn in, above its panorama (PNG); empty for panoramas."""
+    from sfa_localization.bags.drives import images_at
+    from sfa_localization.camera.calibration import check_image
+    from sfa_localization.camera.encodings import encode_png
+    from sfa_localization.camera.panorama import Unwrapper
+
+    model, run = trained.model, trained.runs[0]
+    if model.lens is None or trained.lens is None:
+        return b''
+    middle = int(run.panoramas.stamps_ns[len(run.panoramas) // 2])
+    image = next(iter(images_at(bag, [middle], used).values()), None)
+    unwrapper = Unwrapper(used.camera, model.panorama, model.lens)
+    return b'' if image is None else encode_png(check_image(image, unwrapper))

@@ -36,25 +36,38 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 def read_arrays(path: Path, kind: str, version: int, remedy: str) -> Arrays:
     """Arrays of an .npz file whose header names its kind and version. Raises ModelError."""
+    header = read_header(path, kind, version, remedy)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        intact = header.get(_CHECKSUM) == _checksum(arrays, header)
+    except Exception:  # zip and numpy fail in many ways on foreign bytes
+        raise _unreadable(path, kind, remedy) from None
+    if not intact:
+        raise ModelError(f'{path}: damaged (its checksum is wrong or missing): {remedy} again')
+    return arrays
+
+
+def read_header(path: Path, kind: str, version: int, remedy: str) -> dict[str, Any]:
+    """The header of such a file, without reading the rest. Raises ModelError."""
     if not os.path.isfile(path):
         raise ModelError(f'{path}: {absence(path)}: {remedy}')
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-        header = json.loads(str(arrays[_HEADER]))
+            header: dict[str, Any] = json.loads(str(file[_HEADER]))
         stored = {name: short_line(str(header[name])) for name in ('format', 'version')}
-        intact = header.get(_CHECKSUM) == _checksum(arrays, header)
     except Exception:  # zip, numpy and json fail in many ways on foreign bytes
-        damaged = f'{path}: not a {kind}, or a damaged one: copy it again'
-        raise ModelError(f'{damaged}, or {remedy}') from None
+        raise _unreadable(path, kind, remedy) from None
     if stored['format'] != kind:
         raise ModelError(f'{path}: a {stored["format"]}, not a {kind}: {remedy}')
     if header['version'] != version:
         reads = f'version {stored["version"]}, this software reads {version}'
         raise ModelError(f'{path}: {reads}: {remedy} again')
-    if not intact:
-        raise ModelError(f'{path}: damaged (its checksum is wrong or missing): {remedy} again')
-    return arrays
+    return header
+
+
+def _unreadable(path: Path, kind: str, remedy: str) -> ModelError:
+    return ModelError(f'{path}: not a {kind}, or a damaged one: copy it again, or {remedy}')
 
 
 def packed(lower: NDArray[Any]) -> NDArray[Any]:

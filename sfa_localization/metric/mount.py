@@ -18,8 +18,8 @@ There are two priors of equal probability: the camera sits above base_link, or w
 measured, to 5 mm, and wheels may slip; or it sits anywhere on the robot and wheels do not slip.
 With a prior's covariance C, the posterior has the covariance (S + C^-1)^-1 = D, the mean D h and
 the evidence (|D| / |C|)^(1/2) exp(h^T D h / 2), times the likelihood of how images change in turns
-on the spot (keyframes/turning.py). The evidence mixes both. Where a drive never turns, l stays
-uncertain.
+on the spot (keyframes/turning.py). The lever arm that tracked points show is one more measurement
+of l. The evidence mixes both. Where a drive never turns, l stays uncertain.
 """
 
 from __future__ import annotations
@@ -64,6 +64,9 @@ class Mount:
     covariance: Array | None = None
     turning: Quantity | None = None
     """|l|^2, m^2, by how images change in turns on the spot."""
+    tracked: tuple[complex, float] | None = None
+    """The lever arm by the points that images show (`camera/learned_lens.py`), and its standard
+    deviation along each axis, m."""
     learned: tuple[complex, float] | None = None
     """The lever arm by images alone, and the standard deviation of its coordinates, m."""
 
@@ -107,6 +110,10 @@ class Mount:
         value = np.array([moved.real, moved.imag, 0.0, 0.0, *mount.yaw[1:]])
         information = information[np.ix_(free, free)]
         pull = information @ value - gradient[free]
+        if self.tracked is not None:
+            tracked, std = self.tracked
+            information[[0, 1], [0, 1]] += 1 / std**2
+            pull[:2] += (tracked - center).real / std**2, (tracked - center).imag / std**2
         means, spreads, evidence = [], [], []
         for prior in mount._priors():
             spread = np.linalg.inv(information + np.diag(1 / prior))

@@ -26,6 +26,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions, install_signal_handlers
 from std_msgs.msg import Header
 
+from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.data.errors import ConfigError, LocalizationError
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.settings import Settings
@@ -90,6 +91,11 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     def health(self) -> tuple[int, str, dict[str, str]]:
         """Diagnostic level, one line, and further values."""
         return DiagnosticStatus.OK, 'running', {}
+
+    def find_files(self, words: Sequence[str]) -> None:
+        """Find files that the parameter file names, by the words of the command line."""
+        if parameters.resolve_beside_file(self, self._settings, words):
+            self.settings_changed(self._settings[CameraConfig])
 
     # A node uses these methods.
 
@@ -323,6 +329,7 @@ def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
         executor = SingleThreadedExecutor()  # after a signal it cannot be made
         node = make()
         parameters.warn_of_arguments(node, words)
+        node.find_files(words)
         if not node.start():
             return entry.CANNOT_START if rclpy.ok() else 0
         executor.add_node(node)

@@ -21,6 +21,7 @@ from sfa_localization.camera.calibration_files import calibration_of_info
 from sfa_localization.camera.capture import Feed, FeedStatus, opener
 from sfa_localization.camera.leveling import leveled, tilts_at
 from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.rim_watch import RimWatch
 from sfa_localization.camera.settings import (
     CameraConfig,
     CaptureConfig,
@@ -28,7 +29,7 @@ from sfa_localization.camera.settings import (
     PanoramaConfig,
 )
 from sfa_localization.camera.watch import FrozenWatch
-from sfa_localization.data.errors import MessageError
+from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.messages import read_stamp, read_tilt
 from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
@@ -39,6 +40,7 @@ from sfa_localization.nodes.image_input import ImageInput
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import OmnicamNodeConfig
+from sfa_localization.place_model import camera_of
 
 _DEMAND_PERIOD_S = 0.1  # between checks for subscribers: a new one waits no longer for images
 _LITTLE_VISIBLE = 0.5  # a smaller visible share of the panorama gives a warning
@@ -51,6 +53,7 @@ _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatu
 class OmnicamNode(lifecycle.LocalizationNode):
     """Unwraps each image and publishes it as `panorama` and `panorama/compressed`.
 
+    Lens and panorama are those of the `model`; parameters that describe a lens replace its lens.
     `panorama/info`, latched, gives the elevations of the rows and the direction of the columns.
     """
 
@@ -68,6 +71,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._images: ImageInput | None = None
         self._calibrations: Any = None
         self._lens: LensCalibration | None = None
+        self._trained: PanoramaConfig | None = None
+        self._rim: RimWatch | None = None
         self._unwrapper = self._new_unwrapper(self._settings)
         self._newest: deque[tuple[int, Image]] = deque(maxlen=1)
         self._tilts: deque[tuple[int, float, float]] = deque(maxlen=_ORIENTATIONS)
@@ -76,6 +81,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
     # Life cycle.
 
     def setup(self) -> None:
+        if self._config.model:
+            self._use(self._config.model)
         self._unwrapper.check(self._size)
         self._frozen = FrozenWatch()
         self._panoramas = self.publisher(ImageMessage, 'panorama', 2)
@@ -102,8 +109,28 @@ class OmnicamNode(lifecycle.LocalizationNode):
             self.subscribe(Imu, _IMU, self._take_orientation, lifecycle.sensor_qos(20))
         self.every(_DEMAND_PERIOD_S, self._follow_demand)
 
+    def _use(self, model: str) -> None:
+        """Take panorama and lens from a model. Raises ModelError, and ConfigError for parameters
+        that ask for another panorama.
+        """
+        self._trained, lens = camera_of(model)
+        differences = self._trained.asked_differences(self.settings(PanoramaConfig))
+        if differences:
+            raise ConfigError(
+                f'the panorama of {model} differs from parameters of omnicam_node: {differences}; '
+                'leave these out, or train with them'
+            )
+        self._lens = None if self.settings(CameraConfig).is_described else lens
+        self._unwrapper = self._new_unwrapper(self._settings, self._lens)
+        if self._lens is not None and self._lens.radius_max:
+            self._rim = RimWatch(self._lens)
+
+    @property
+    def _panorama(self) -> PanoramaConfig:
+        return self._trained or self.settings(PanoramaConfig)
+
     def started(self) -> None:
-        self._info.publish(convert.to_info(self.settings(PanoramaConfig)))
+        self._info.publish(convert.to_info(self._panorama))
         self._follow_demand()
         if self._feed is not None and self._feed.status().state == 'new':
             self._feed.start()
@@ -128,8 +155,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         elif self._listening_since_s is None and self._images is not None:
             self._listening_since_s = steady_s()
             self._images.start(self._substitute)
-            camera = self.settings(CameraConfig)
-            if not (camera.calibration_file or camera.camera_model):
+            if self._lens is None and not self.settings(CameraConfig).is_described:
                 take, qos, topic = self._take_calibration, lifecycle.sensor_qos(1), self._info_topic
                 self._calibrations = self.subscribe(CameraInfo, _CAMERA_INFO, take, qos, topic)
 
@@ -204,7 +230,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         tilts = np.reshape([tilt for _, *tilt in self._tilts], (-1, 2))
         (tilt,) = tilts_at(np.array([stamp_ns]), stamps_ns, tilts)
         self._is_level = bool(np.isfinite(tilt).all())
-        sphere = self.settings(PanoramaConfig).sphere
+        sphere = self._panorama.sphere
         return leveled(panorama, tilt, sphere) if self._is_level else panorama
 
     def _publish(self, stamp_ns: int, image: Image, frame: str) -> None:
@@ -217,6 +243,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
             compressed = convert.to_compressed(panorama, stamp_ns, frame, _JPEG_QUALITY)
             self._compressed.publish(compressed)
         self._frozen.add(image)
+        if self._rim is not None:
+            self._rim.add(image)
 
     # Parameters that change while running.
 
@@ -231,11 +259,10 @@ class OmnicamNode(lifecycle.LocalizationNode):
         elif isinstance(settings, (CameraConfig, PanoramaConfig)):
             self._unwrapper = self._new_unwrapper(self._settings, self._lens)
             if self.active:
-                self._info.publish(convert.to_info(self.settings(PanoramaConfig)))
+                self._info.publish(convert.to_info(self._panorama))
 
-    @staticmethod
-    def _new_unwrapper(settings: Current, lens: LensCalibration | None = None) -> Unwrapper:
-        camera, panorama = settings[CameraConfig], settings[PanoramaConfig]
+    def _new_unwrapper(self, settings: Current, lens: LensCalibration | None = None) -> Unwrapper:
+        camera, panorama = settings[CameraConfig], self._trained or settings[PanoramaConfig]
         return Unwrapper(cast(CameraConfig, camera), cast(PanoramaConfig, panorama), lens)
 
     def health(self) -> tuple[int, str, dict[str, str]]:
@@ -275,6 +302,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         details['panorama visible [%]'] = f'{100 * visible:.0f}'
         if visible < _LITTLE_VISIBLE:
             return _WARN, f'the camera sees only {100 * visible:.0f} % of the panorama'
+        if self._rim is not None and self._rim.problem:
+            return _WARN, self._rim.problem
         if not self._is_level:
             topic = self.full_name(_IMU)
             return _WARN, f'no orientation on {topic} near images: panoramas are not leveled'

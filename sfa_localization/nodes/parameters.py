@@ -8,6 +8,7 @@ import array
 import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import (
@@ -19,7 +20,13 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from sfa_localization.config import given_names, ignored_sections, unknown_names
+from sfa_localization.camera.settings import CameraConfig
+from sfa_localization.config import (
+    given_names,
+    ignored_sections,
+    resolved_beside,
+    unknown_names,
+)
 from sfa_localization.data.errors import ConfigError, LocalizationError
 from sfa_localization.data.settings import Settings, nearest
 
@@ -128,6 +135,23 @@ def warn_of_arguments(node: Node, words: Sequence[str]) -> None:
             )
     for unknown in unknown_names(given):
         logger.warning(f'unknown parameter {unknown!r}{nearest(unknown, declared)}')
+
+
+def resolve_beside_file(node: Node, current: Current, words: Sequence[str]) -> bool:
+    """Resolve the camera's calibration_file against the folder of the parameter file that names it;
+    False where none does.
+    """
+    if CameraConfig not in current:
+        return False
+    pairs, given = [*itertools.pairwise(words)], 'calibration_file'
+    if any(flag in ('-p', '--param') and value.startswith(given) for flag, value in pairs):
+        return False
+    for file in reversed([value for flag, value in pairs if flag == '--params-file']):
+        with suppress(ConfigError):  # ROS, which is less strict, has read it
+            if given in given_names(file, node.get_fully_qualified_name()):
+                current[CameraConfig] = resolved_beside(current[CameraConfig], file)
+                return True
+    return False
 
 
 def _declare_field(node: Node, item: dataclasses.Field[Any]) -> Any:

@@ -30,6 +30,9 @@ class NodeConfig(Settings):
 class OmnicamNodeConfig(Settings):
     """omnicam_node: camera images in, panoramas out."""
 
+    model: str = setting(
+        '', 'file of the trained model: its lens and panorama are used; empty: the parameters'
+    )
     image_transport: str = setting('raw', 'which topic to take images from', choices=_TRANSPORTS)
     frame_id: str = setting('', "frame of the panoramas; empty: the image's own, or omnicam")
 

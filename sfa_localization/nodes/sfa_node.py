@@ -18,7 +18,12 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from sfa_localization.camera.panorama import Unwrapper
-from sfa_localization.camera.settings import CameraConfig, PanoramaConfig, WatchConfig
+from sfa_localization.camera.settings import (
+    CameraConfig,
+    LensCalibration,
+    PanoramaConfig,
+    WatchConfig,
+)
 from sfa_localization.camera.watch import EXPLAINED_WARNING
 from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.run import Image
@@ -138,8 +143,9 @@ class SfaNode(LocalizationNode):
         model = self._observer.model
         if problem := self._declared_problem(model.panorama):
             raise MessageError(problem)
-        if self._declared is None and model.mount_rpy:  # omnicam_node would have mounted it
-            image = _unwrapper(model.mount_rpy, model.panorama)(image)
+        of_panoramas = model.lens is not None and model.lens.camera_model == 'panorama'
+        if self._declared is None and of_panoramas:  # omnicam_node would have mounted it
+            image = _unwrapper(model.lens, model.panorama)(image)
         self._last = observation = self._observer.observe(stamp_ns, image)
         self._publish(observation)
         if observation.problem:
@@ -184,8 +190,8 @@ class SfaNode(LocalizationNode):
 
 
 @lru_cache(maxsize=1)
-def _unwrapper(mount_rpy: tuple[float, ...], panorama: PanoramaConfig) -> Unwrapper:
-    return Unwrapper(CameraConfig(mount_rpy=mount_rpy), panorama)
+def _unwrapper(lens: LensCalibration, panorama: PanoramaConfig) -> Unwrapper:
+    return Unwrapper(CameraConfig(), panorama, lens)
 
 
 def _feature_pose(slow: Any, stamp_ns: int) -> PoseStamped:

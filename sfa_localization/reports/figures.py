@@ -27,6 +27,12 @@ def save(figure: Figure, path: Path) -> None:
         figure.savefig(file, dpi=DOTS_PER_INCH, format='png')
 
 
+def write_picture(path: Path, picture: bytes) -> None:
+    """Write a PNG, completely or not at all. Raises LocalizationError."""
+    with atomic_write(path) as file:
+        file.write(picture)
+
+
 def save_text(path: Path, text: str) -> None:
     """Write a text file, completely or not at all. Raises LocalizationError."""
     with atomic_write(path) as file:

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sfa_localization.camera.lens_report import sentence
 from sfa_localization.inspection import InspectionConfig, too_sparse
 from sfa_localization.metric.motion_sources import MAP
 from sfa_localization.training import Trained
@@ -43,6 +44,7 @@ def summary(trained: Trained) -> str:
         lines.append(
             f'heading: expect {quality["expected_yaw_error_deg"]:.1f} degrees mean error there'
         )
+    lines += [f'lens: {sentence(trained.lens)}'] if trained.lens else []
     lines += [*trained.model.rig.as_text(), *point_lines(quality)]
     for run, check in zip(trained.runs, trained.checks, strict=False):
         lines += [f'{run.name}: {text}' for text in check.wrong + check.corrected]

@@ -30,6 +30,8 @@ _CAPTIONS = {
     'coverage': 'Where images were taken (black), on the expected error of one image',
     'line_fits': 'Each segment by odometry (wide) and by slow features (thin)',
     'firing_maps': 'Slow features at the places of the images: good ones change smoothly',
+    'lens': 'The lens that the drive shows: elevations (green) in an image and in its panorama, '
+    'whose edges are yellow',
     'worst_images': 'Images that the map puts farthest from where they were taken',
 }
 
@@ -47,9 +49,13 @@ def worst_of(trained: Trained) -> dict[WorstImage, tuple[int, int]]:
 
 
 def write_training_report(
-    folder: Path, trained: Trained, samples: Mapping[WorstImage, Image] | None = None
+    folder: Path,
+    trained: Trained,
+    samples: Mapping[WorstImage, Image] | None = None,
+    lens: bytes = b'',
 ) -> None:
-    """Write figures of the training, with `samples` of the worst images, and index.html.
+    """Write figures of the training, with `samples` of the worst images and a picture (PNG) of the
+    lens, and index.html.
 
     Raises LocalizationError if a file cannot be written.
     """
@@ -59,7 +65,10 @@ def write_training_report(
     firing_maps_figure(folder / 'firing_maps.png', places, trained.features[images])
     if samples:
         figures.write_worst_images(folder / 'worst_images.png', samples)
-    names = [name for name in _CAPTIONS if samples or name != 'worst_images']
+    if lens:
+        figures.write_picture(folder / 'lens.png', lens)
+    drawn = {'lens': bool(lens), 'worst_images': bool(samples)}
+    names = [name for name in _CAPTIONS if drawn.get(name, True)]
     parts = {name: page.figure(folder / f'{name}.png', _CAPTIONS[name]) for name in names}
     page.write_page(
         folder,
@@ -71,6 +80,7 @@ def write_training_report(
         page.section('May I trust it?', page.items(trust_lines(trained))),
         page.section('What do I drive next?', page.items(advice(trained, places))),
         *(motion_section(check.as_dict()) for check in trained.checks),
+        page.section('The camera', parts.get('lens', '')),
         page.section('Slow features', parts['firing_maps']),
         page.section('Worst images', parts.get('worst_images', '')),
     )  # fmt: skip

@@ -31,7 +31,6 @@ from sfa_localization.simulation.routes import ROUTES, Lawn, Motion, Route
 from sfa_localization.simulation.settings import SimulationConfig
 
 START_NS = 1_700_000_000 * 10**9
-RAW_SIZE = 640, 640  # rows, columns of the simulated mirror's images
 REST_S = 0.5  # at the start and the end of each drive
 ACCELERATION = 1.0  # m/s^2
 TURN_RATE = 0.6  # rad/s, on the spot
@@ -267,15 +266,19 @@ def record(
     out: Path,
     panorama: PanoramaConfig | None = None,
     progress: bool = False,
+    lens: LensCalibration | None = None,
 ) -> None:
-    """Record a drive to the bag `out`; `progress` shows a bar.
+    """Record a drive to the bag `out`; `progress` shows a bar. Raw images are those of a `lens`, by
+    default of the mirror.
 
     Raises BagError when the bag exists or cannot be written, ConfigError for impossible settings.
     After an error or Ctrl-C nothing is left.
     """
     view = panorama_view(panorama or PanoramaConfig())
     if config.images == 'raw':
-        view = raw_view(make_camera(LensCalibration(), RAW_SIZE).unproject, RAW_SIZE)
+        lens = lens or LensCalibration()
+        size = lens.image_height, lens.image_width
+        view = raw_view(make_camera(lens, size, mount_rpy=lens.mount_rpy).unproject, size)
     with BagWriter(out, config.storage) as bag:
         noisy = render_images(garden, driven, config, view)
         count = len(driven.image_stamps_ns)

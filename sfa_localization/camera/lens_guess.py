@@ -1,0 +1,146 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a few images tell about a lens: its kind and rim, and the models that may fit a drive."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from sfa_localization.camera import kinds, lens_models
+from sfa_localization.camera.calibration import Circle, MirrorCircles, find_circles
+from sfa_localization.camera.lens_models import LensCircle, LensModel
+from sfa_localization.camera.lenses import CameraModel, make_camera
+from sfa_localization.camera.point_tracks import changing
+from sfa_localization.camera.settings import LensCalibration
+from sfa_localization.data.errors import CameraError
+from sfa_localization.data.rig import Quantity
+from sfa_localization.data.run import Image
+
+_CENTERED = 0.007  # of the radius: standard deviation of the lens's center about that of its rim
+_UNCERTAIN = 0.03  # the same for a rim that is hardly visible
+_CLEAR_SUPPORT, _CLEAR_SHARE = 0.9, 0.95  # of a rim's directions; of its disc that changes
+_EDGE_STD = np.radians(20.0)  # of the elevation of an edge of a panorama
+_USUAL_EDGES = np.radians([-12.0, 24.0])
+_CONTRAST = 0.05  # relative difference of brightness that tells the sky from the ground
+
+
+@dataclass(frozen=True, slots=True)
+class LensGuess:
+    """A kind of camera (see `kinds`), its rims, and what is known of its calibration."""
+
+    kind: str
+    circles: tuple[LensCircle, ...]
+    base: LensCalibration
+
+    @classmethod
+    def of(cls, samples: Sequence[Image]) -> LensGuess:
+        """From images (H, W, 3) from all over a drive. Raises CameraError for ordinary cameras."""
+        height, width = samples[0].shape[:2]
+        geometry = kinds.guess_geometry(samples)
+        kind = kinds.CameraKind(*geometry[:2], width, height)
+        base = LensCalibration(
+            image_width=width, image_height=height, radius_min=0.0, radius_max=0.0
+        )
+        if kind.lack:
+            raise CameraError(f'{kind}: {kind.lack}')
+        if kind.is_panorama:
+            return cls(kind.name, (), base)
+        if kind.name == kinds.DUAL_FISHEYE:
+            halves = [sample[:, :height] for sample in samples], [s[:, height:] for s in samples]
+            first, second = map(_circle, halves, geometry.circles)
+            second = replace(second, column=second.column + width - height)
+            return cls(kind.name, (first, second), base)
+        circle = _circle(samples, *geometry.circles)
+        base = replace(base, radius_min=circle.hole, radius_max=circle.radius)
+        return cls(kind.name, (circle,), base)
+
+    @property
+    def cameras(self) -> list[CameraModel]:
+        """Two guesses, whose images rotate in opposite directions as the robot turns."""
+        (model, *_), (other, *_) = self.models(0), self.models(1)
+        return [_camera(model, self.base), _camera(other, self.base)]
+
+    def models(self, direction: int) -> list[LensModel]:
+        """The models of lenses whose images rotate as those of camera `direction`."""
+        base, mirrored = self.base, ('no', 'yes')[direction]
+        if self.kind == kinds.DUAL_FISHEYE:
+            return [lens_models.dual_fisheye(base, self.circles, upside_down=bool(direction))]
+        if not self.circles:
+            base = replace(base, camera_model='equirectangular', mirrored=mirrored)
+            edges = [Quantity(edge, _EDGE_STD) for edge in _USUAL_EDGES.tolist()]
+            edges = [] if self.kind == kinds.EQUIRECTANGULAR else edges
+            return [lens_models.equirectangular(base, edges)]
+        (circle,), other = self.circles, ('yes', 'no')[direction]
+        up = replace(base, axis='up', mirrored=mirrored)
+        down = replace(base, axis='down', mirrored=other)
+        fisheyes = [lens_models.fisheye(lens, circle) for lens in (up, down)]
+        return [*fisheyes, lens_models.mirror(down, circle)]
+
+    def sides(self, horizon: float, samples: Sequence[Image]) -> tuple[str, ...]:
+        """Where the center of the image may look (up, down, forward), as what is beyond one side of
+        the `horizon`, px, is brighter: the sky, or a ceiling.
+        """
+        if len(self.circles) != 1:
+            return ('forward',)
+        contrast = self._contrast(horizon, samples)
+        if abs(contrast) < _CONTRAST:
+            return ('up', 'down')
+        return ('down',) if contrast > 0 else ('up',)
+
+    def _contrast(self, horizon: float, samples: Sequence[Image]) -> float:
+        """By how much the ring outside of the horizon is brighter than the one inside, relative to
+        both.
+        """
+        (circle,) = self.circles
+        height, width = samples[0].shape[:2]
+        rows, columns = np.mgrid[:height, :width]
+        radius = np.hypot(columns - circle.column, rows - circle.row)
+        mean = np.mean([sample.mean(axis=2) for sample in samples], axis=0)
+        inside = mean[(radius > max(0.6 * horizon, circle.hole)) & (radius < 0.95 * horizon)]
+        outside = mean[(radius > 1.05 * horizon) & (radius < min(1.5 * horizon, circle.radius))]
+        if not (inside.size and outside.size):
+            return 0.0
+        bright, dark = float(outside.mean()), float(inside.mean())
+        return (bright - dark) / (bright + dark + 1e-9)
+
+
+def _camera(model: LensModel, base: LensCalibration) -> CameraModel:
+    """The camera that a model expects."""
+    lens = model.calibration({name: quantity.value for name, quantity in model.prior.items()})
+    roll = model.prior.get('roll', Quantity(0.0, 0.0)).value
+    size = base.image_height, base.image_width
+    return make_camera(lens, size, mount_rpy=(float(np.degrees(roll)), 0.0, 0.0))
+
+
+def _circle(samples: Sequence[Image], circles: MirrorCircles) -> LensCircle:
+    """The rim with its hole; where no rim is clear, the center is uncertain."""
+    rim, hole = circles.rim, circles.hole.radius if circles.hole else 0.0
+    clear = _clear_rim(samples, rim)
+    if clear is None:
+        return LensCircle(rim.column, rim.row, rim.radius, _UNCERTAIN * rim.radius, hole)
+    return LensCircle(*clear, _CENTERED * clear[2], hole)
+
+
+def rim_of(samples: Sequence[Image]) -> tuple[float, float, float] | None:
+    """Column, row and radius, px, of a rim in images (H, W, 3) that is clear; None without."""
+    try:
+        return _clear_rim(samples, find_circles(samples).rim)
+    except CameraError:
+        return None
+
+
+def _clear_rim(samples: Sequence[Image], rim: Circle) -> tuple[float, float, float] | None:
+    """The rim, or the smallest circle around what changes in images where that is clearer."""
+    if rim.support >= _CLEAR_SUPPORT:
+        return rim.column, rim.row, rim.radius
+    rows, columns = np.nonzero(changing(samples))
+    if not len(rows):
+        return None
+    points = np.column_stack([columns, rows]).astype(np.float32)
+    (column, row), radius = cv2.minEnclosingCircle(points)
+    share = cv2.contourArea(cv2.convexHull(points)) / (np.pi * radius**2)
+    return (float(column), float(row), float(radius)) if share >= _CLEAR_SHARE else None
