@@ -9,7 +9,7 @@ import numpy as np
 from filter_drives import FilterDrive
 
 from sfa_localization.bags.writer import BagWriter
-from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.rig import Rig
@@ -58,7 +58,7 @@ class PictureReader:
     error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
     rig: Rig = dataclasses.field(default_factory=Rig)
     ground: DrivenGround = dataclasses.field(default_factory=lambda: DROVE)
-    mount_rpy: tuple[float, ...] = ()
+    lens: LensCalibration | None = None
 
     def prepared(self, images):
         return images

@@ -50,7 +50,7 @@ PLACES = {'robot1': (3.0, 4.0, 0.5), 'robot2': (20.0, 11.0, -1.0)}
 PARAMETERS = f"""
 /**/omnicam_node:
   ros__parameters: {{camera_model: panorama, width: {SIZE.width}, height: {SIZE.height}}}
-/**:
+/**/sfa_node:
   ros__parameters: {{model: model.npz}}
 /robot1/ekf_node:
   ros__parameters: {{lost_std: 1.5}}

@@ -80,7 +80,7 @@ CASES = {
         --min-pictures 9999 => drive until there are 9999""",
     'calibrate': """
         --image-topic /nothing => /nothing; --odom-topic /nothing => /nothing
-        --calibration {data}/info.yaml => fisheye; --radii 50x180 => radius_min: 50
+        --calibration {data}/info.yaml => fisheye; --radii 50x300 => radius_min: 50
         --output {out}/camera.yaml; --check {out}/check.png; --axis up => axis: up
         --mirrored no => mirrored: 'no'; --mount-rpy 0x0x90""",
     'filter': '--config {data}/start.yaml; --output {out}/other.tum',

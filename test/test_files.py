@@ -12,10 +12,9 @@ import sys
 from pathlib import Path
 from unittest import mock
 
-import cv2
 import numpy as np
 import pytest
-from test_calibration import scene
+from test_calibration import INFO
 
 from sfa_localization.bags import writer as bag_writer
 from sfa_localization.bags.writer import BagWriter
@@ -153,8 +152,9 @@ def test_no_output_replaces_what_it_should_not(tmp_path, monkeypatch, capsys):
 
 def test_an_output_replaces_an_empty_file_and_what_the_command_wrote(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    cv2.imwrite('picture.png', scene(1))
-    for command in ('config --output a.yaml', 'calibrate picture.png --output camera.yaml'):
+    Path('info.yaml').write_text(INFO)
+    calibrate = 'calibrate --calibration info.yaml --output camera.yaml'
+    for command in ('config --output a.yaml', calibrate):
         Path(command.split()[-1]).touch()
         assert main(command.split()) == 0
     assert main(command.split()) == 0

@@ -21,7 +21,9 @@ from sfa_localization.camera.calibration_files import calibration_text
 from sfa_localization.camera.encodings import decode_compressed
 from sfa_localization.camera.leveling import leveled
 from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.rim_watch import RimWatch
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
+from sfa_localization.config import load_settings
 
 pytest.importorskip('rclpy')
 
@@ -34,7 +36,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_msgs.msg import String
 
 from sfa_localization.camera.video import ImageReader
-from sfa_localization.data.errors import CameraError
+from sfa_localization.data.errors import CameraError, ConfigError
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.nodes.conversions import (
     read_info,
@@ -45,6 +47,7 @@ from sfa_localization.nodes.conversions import (
 from sfa_localization.nodes.image_input import ImageInput
 from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.nodes.omnicam_node import OmnicamNode
+from sfa_localization.place_model import PlaceModel
 
 pytestmark = pytest.mark.ros
 PANORAMA = PanoramaConfig(width=120, height=12)
@@ -213,6 +216,64 @@ def test_camera_info_beside_the_images_describes_the_camera(bench, rule, images,
     expected = Unwrapper(CameraConfig(), PANORAMA, FISHEYE)(raw_picture())
     np.testing.assert_array_equal(pixels(answer(bench, heard, message(), images)), expected)
     assert node.health()[2]['camera model'] == 'fisheye'
+
+
+def test_lens_and_panorama_are_those_of_the_model(bench, trained, tmp_path):
+    """Unless the parameters describe a lens; a panorama asked otherwise is refused, and images of
+    another shape are.
+    """
+    lens = dataclasses.replace(FISHEYE, image_width=640, image_height=640, mount_rpy=(0, 0, 40.0))
+    model, path = dataclasses.replace(PlaceModel.load(trained.model), lens=lens), tmp_path / 'm.npz'
+    model.save(path)
+    node = bench.run(OmnicamNode, model=str(path))
+    heard, monitor = bench.listen(Image, 'panorama'), node.monitors['image_raw']
+    expected = Unwrapper(CameraConfig(), model.panorama, lens)(raw_picture())
+    np.testing.assert_array_equal(pixels(answer(bench, heard, message())), expected)
+    cropped = to_image(raw_picture()[:480], STAMP_NS, 'camera')
+    assert bench.publish_until('image_raw', cropped, lambda: monitor.refused)
+    assert 'set the camera to the size of the training' in ' '.join(monitor.refused)
+    bench.end(node)
+    node = bench.run(OmnicamNode, model=str(path), camera_model='mirror')
+    heard = bench.listen(Image, 'panorama')
+    expected = Unwrapper(MIRROR, model.panorama)(raw_picture())
+    np.testing.assert_array_equal(pixels(answer(bench, heard, message())), expected)
+    bench.end(node)
+    node = bench.run(OmnicamNode, autostart=False, model=str(path), elevation_min=-20.0)
+    with pytest.raises(ConfigError, match=r'elevation_min -20\.0 instead of -12\.0; leave'):
+        node.setup()
+
+
+def test_a_calibration_file_lies_beside_the_parameter_file_that_names_it(bench, tmp_path):
+    (tmp_path / 'camera.yaml').write_text(calibration_text(FISHEYE))
+    file, text = tmp_path / 'robot.yaml', 'calibration_file: camera.yaml'
+    file.write_text(f'/**/omnicam_node:\n  ros__parameters:\n    {text}\n')
+    for more, found in (([], True), (['-p', 'calibration_file:=camera.yaml'], False)):
+        node = bench.run(OmnicamNode, autostart=False, calibration_file='camera.yaml')
+        node.find_files(['--ros-args', '--params-file', str(file), *more])
+        path = node.settings(CameraConfig).calibration_file
+        assert path == (str(tmp_path / 'camera.yaml') if found else 'camera.yaml')
+        bench.end(node)
+    assert load_settings(file, 'omnicam_node', CameraConfig).calibration_file == str(
+        tmp_path / 'camera.yaml'
+    )
+
+
+@pytest.mark.parametrize('crop', [0, 40])
+def test_a_rim_elsewhere_than_in_training_is_named(crop):
+    """Once the robot has moved enough for twelve images that differ."""
+    lens = LensCalibration(
+        image_width=640, image_height=640, cx=319.5, cy=319.5, radius_max=300.0, radius_min=0.0
+    )
+    rows, columns = np.mgrid[:640, :640]
+    inside = np.hypot(columns - 319.5, rows - 319.5)[..., None] < 300
+    watched = RimWatch(lens)
+    for number in range(130):
+        image = np.maximum(raw_picture(number // 10), 60) * inside.astype(np.uint8)
+        watched.add(np.ascontiguousarray(image[crop : 640 - crop, crop : 640 - crop]))
+    assert until(lambda: watched.done)
+    assert bool(watched.problem) == bool(crop)
+    if crop:
+        assert 'px, in training 320, 320 and 300: was its image cropped' in watched.problem
 
 
 def test_it_outlives_every_bad_image_and_counts_each(bench):

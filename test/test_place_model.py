@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from sfa_localization import evaluation, training, updating
 from sfa_localization.camera.panorama import Unwrapper, repeated_pixels
-from sfa_localization.camera.settings import CameraConfig
+from sfa_localization.camera.settings import CameraConfig, LensCalibration
 from sfa_localization.data.array_files import read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError, ModelError
@@ -23,7 +23,7 @@ from sfa_localization.keyframes.light import Conditions
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE
 from sfa_localization.localizer import Localizer
 from sfa_localization.observer import Observer
-from sfa_localization.place_model import FORMAT, VERSION, PlaceModel
+from sfa_localization.place_model import FORMAT, VERSION, PlaceModel, camera_of
 
 
 @pytest.fixture(scope='module')
@@ -59,7 +59,7 @@ def test_linear_algebra_uses_a_single_core(model, pictures, entry, tmp_path, mon
         threads.append({pool['num_threads'] for pool in threadpool_info()})
         raise DataError('seen')
 
-    names = 'training.read_drives', 'updating.read_drive', 'evaluation.read_drive'
+    names = 'training.with_lens', 'updating.read_drive', 'evaluation.read_drive'
     for name in (*names, 'sfa.network.input_map'):
         monkeypatch.setattr(f'sfa_localization.{name}', look)
     with threadpool_limits(2), pytest.raises(DataError, match='seen'):
@@ -125,14 +125,19 @@ def test_a_model_is_the_same_after_it_was_saved(model, saved, pictures, tmp_path
     assert (tmp_path / 'again.npz').read_bytes() == saved.read_bytes()
 
 
+LENS = LensCalibration(
+    camera_model='fisheye', distortion=(0.1, 0.0, 0.0, 0.0), mount_rpy=(5.0, 0.0, 30.0)
+)
+
+
 def test_a_model_masks_what_it_has_not_seen_in_training(model, pictures, tmp_path):
     """Whoever gives it panoramas: masked or not, they show the same."""
     camera = Unwrapper(CameraConfig(blind_sectors=(150.0, 210.0)), model.panorama)
     repeated = repeated_pixels(camera.visible((1, 4)))
-    masked = replace(model, repeated=repeated, mount_rpy=(5.0, 0.0, 30.0))
+    masked = replace(model, repeated=repeated, lens=LENS)
     masked.save(tmp_path / 'masked.npz')
     masked = PlaceModel.load(tmp_path / 'masked.npz')
-    assert masked.mount_rpy == (5.0, 0.0, 30.0)
+    assert masked.lens == LENS and camera_of(tmp_path / 'masked.npz') == (model.panorama, LENS)
     covered, blind = pictures[:2].copy(), ~camera.visible((1, 4))
     covered[:, blind] = 200
     expected = model.locate_all(np.stack([camera(picture) for picture in pictures[:2]]))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from picture_readers import DROVE, SIZE, PictureReader, panorama
 
+from sfa_localization.camera.settings import LensCalibration
 from sfa_localization.camera.watch import EXPLAINED_WARNING, FROZEN_IMAGES
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.rig import Quantity, Rig
@@ -100,7 +101,8 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
 
 def test_a_panorama_of_the_camera_itself_is_mounted_as_in_training(bench, models):
     """That of omnicam_node, which declares it, is so already."""
-    models['a.npz'].mount_rpy = (0.0, 0.0, 90.0)
+    lens = LensCalibration(camera_model='panorama', mirrored='no', mount_rpy=(0.0, 0.0, 90.0))
+    models['a.npz'].lens = lens
     node = bench.run(SfaNode, model='a.npz')
     poses = bench.listen(PoseStamped, 'sfa/pose')
     turned = np.roll(panorama(PLACE, 1), SIZE.width // 4, axis=1)

@@ -338,24 +338,28 @@ def triangulated(point: Indices, places: Array, rays: Array, passes: int = 3) ->
     homogeneous, (X, w) with w >= 0, as it may be infinitely far: it minimizes the weighted sum of
     |(I - r r^T) (X - w c)|^2 over its rays r from c, of unit length.
     """
-    count = int(point[-1]) + 1
+    starts = np.flatnonzero(np.diff(point, prepend=-1))
 
     def sums(values: Array) -> Array:
-        return np.stack([np.bincount(point, column, count) for column in values.T], axis=1)
+        return np.add.reduceat(values, starts, axis=0)
 
     centers = np.column_stack([places, np.zeros(len(places))])
-    centers = (centers - (sums(centers) / sums(np.ones((len(point), 1))))[point]) / _REFERENCE_M
+    counts = sums(np.ones((len(point), 1)))
+    centers = (centers - (sums(centers) / counts)[point]) / _REFERENCE_M
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    rows = np.concatenate([across, -across @ centers[..., None]], axis=2)
-    squares = np.einsum('mij,mik->mjk', rows, rows).reshape(-1, 16)
+    column = across @ centers[..., None]
+    corner = np.sum(column * centers[..., None], axis=1, keepdims=True)
+    squares = np.block([[across, -column], [-column.transpose(0, 2, 1), corner]])
     ahead, weight = sums(rays), np.ones((len(point), 1))
     for _ in range(passes):
-        form = sums(weight * squares).reshape(-1, 4, 4)
-        near = np.linalg.eigh(form)[1][:, :, 0]
-        far = np.pad(np.linalg.eigh(form[:, :3, :3])[1][:, :, 0], ((0, 0), (0, 1)))
-        near, far = (p * np.sign(np.sum(p[:, :3] * ahead, 1, keepdims=True)) for p in (near, far))
-        best = np.where(near[:, 3:] > 0, near, far)[point]
-        directions = best[:, :3] - centers * best[:, 3:]
+        form = sums(weight[..., None] * squares)
+        best = np.linalg.eigh(form)[1][:, :, 0]
+        best *= np.sign(np.sum(best[:, :3] * ahead, axis=1, keepdims=True))
+        behind = best[:, 3] <= 0
+        far = np.linalg.eigh(form[behind, :3, :3])[1][:, :, 0]
+        best[behind, :3] = far * np.sign(np.sum(far * ahead[behind], axis=1, keepdims=True))
+        best[behind, 3] = 0.0
+        directions = best[point, :3] - centers * best[point, 3:]
         along = np.sum(directions * rays, axis=1, keepdims=True)
         distance = np.linalg.norm(directions, axis=1, keepdims=True) + 1e-9
         off = np.linalg.norm(directions - rays * along, axis=1, keepdims=True) / distance

@@ -23,13 +23,13 @@ class RimWatch:
     """Compares the rim in the first images of a robot that moves with that of a lens."""
 
     def __init__(self, lens: LensCalibration) -> None:
-        self.problem = ''
+        self.problem, self.done = '', False
         self._lens = lens
         self._samples: list[Image] = []
         self._count = 0
 
     def add(self, image: Image) -> None:
-        """Take the next image (H, W, 3); `problem` says once enough were seen what differs."""
+        """Take the next image (H, W, 3). Once `done`, `problem` says what differs, if anything."""
         self._count += 1
         if len(self._samples) == _SAMPLES or self._count % _EVERY:
             return
@@ -45,14 +45,18 @@ class RimWatch:
 
     def _judge(self, scale: float) -> None:
         """Set the problem, of samples `scale` times as wide as images of the lens."""
-        rim, lens = rim_of(self._samples), self._lens
-        if rim is None:
-            return
+        rim = rim_of(self._samples)
+        self.problem = '' if rim is None else self._moved(rim, scale)
+        self.done = True
+
+    def _moved(self, rim: tuple[float, float, float], scale: float) -> str:
+        """Where a rim lies elsewhere than in training; '' if it does not."""
+        lens = self._lens
         column, row, radius = ((part + 0.5) / scale - 0.5 for part in rim)
         away = abs(complex(column - lens.cx, row - lens.cy))
         if max(away, abs(radius - lens.radius_max)) < _MOVED * lens.radius_max:
-            return
-        self.problem = (
+            return ''
+        return (
             f'the rim of the lens has its center at {column:.0f}, {row:.0f} and a radius of '
             f'{radius:.0f} px, in training {lens.cx:.0f}, {lens.cy:.0f} and '
             f'{lens.radius_max:.0f}: was its image cropped, or another lens mounted?'
