@@ -19,6 +19,7 @@ _MARGIN_DEG = 1.0  # inside of what the lens sees: its edge is blurred
 _BELOW_DEG = -3.0  # what lies lower shows by parallax where a robot is
 _LEAST_DEG, _CERTAIN = 1.5, 4.0  # of a difference: it matters, and exceeds so many deviations
 _LEAST_TURN_DEG = 3.0
+_WORSE = 0.25  # quantile of the cosine
 _BESIDE = 0.5  # sine of the elevations that panoramas show
 
 
@@ -73,11 +74,14 @@ def contradictions(lens: LearnedLens, described: LensCalibration, name: str) -> 
     off = _between(lens.calibration, described)
     if not texts and off > _LEAST_TURN_DEG:
         texts = [f'{name} is {off:.0f} degrees off what the drive shows']
-    return [f'{text}: the description is used; remove it to use the drive' for text in texts]
+    remedy = 'the description is used; remove it to use the lens that the drive shows'
+    return [f'{text}: {remedy}' for text in texts]
 
 
 def _between(lens: LensCalibration, other: LensCalibration) -> float:
-    """Median angle between the rays of pixels of two lenses, beside the horizon, deg."""
+    """Angle between the rays of pixels of two lenses, beside the horizon, deg: that of the worse
+    quarter, as one of two lenses may be right.
+    """
     size = lens.image_height, lens.image_width
     columns, rows = np.meshgrid(np.arange(0, size[1], 7.0), np.arange(0, size[0], 7.0))
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
@@ -85,7 +89,8 @@ def _between(lens: LensCalibration, other: LensCalibration) -> float:
     others = make_camera(other, size, mount_rpy=other.mount_rpy).unproject(pixels)
     cosine = np.sum(rays * others, axis=1)[np.abs(rays[:, 2]) < _BESIDE]
     cosine = cosine[np.isfinite(cosine)]
-    return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) if cosine.size else 180.0
+    low = np.quantile(cosine, _WORSE) if cosine.size else -1.0
+    return float(np.degrees(np.arccos(np.clip(low, -1, 1))))
 
 
 def _of_circle(
