@@ -197,6 +197,7 @@ def test_the_panorama_shows_what_the_lens_sees_unless_others_are_asked(of_mirror
 def test_a_drive_that_does_not_show_the_lens_says_what_is_missing():
     for options, words in (
         ({'seconds': 4.0}, 'drive 5 m, not'), ({'turn': 0.0}, 'turn by 360 degrees in all, not 0'),
+        ({'seconds': 20.0, 'turn': 0.1}, 'turn by 360 degrees in all, not 75'),
         ({'count': 60}, 'points that can be followed'),
     ):  # fmt: skip
         with pytest.raises(CameraError, match=words):

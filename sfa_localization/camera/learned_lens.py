@@ -23,7 +23,7 @@ from scipy.optimize import least_squares
 from sfa_localization.camera.lens_guess import LensGuess
 from sfa_localization.camera.lens_models import LEAN_STD, LensModel, Values
 from sfa_localization.camera.lenses import CameraModel, DualFisheyeLens, Lens, make_camera
-from sfa_localization.camera.point_tracks import Tracks
+from sfa_localization.camera.point_tracks import Tracks, scale_of
 from sfa_localization.camera.settings import LensCalibration
 from sfa_localization.data.errors import CameraError, LocalizationError
 from sfa_localization.data.geometry import Array, Indices, relative, wrap_angle
@@ -62,7 +62,8 @@ class LearnedLens:
     """A lens as a drive shows it: its `calibration`, with the mounting; radius of the `horizon`,
     px, None without a single center; the standard deviations of the center, px, and of roll and
     pitch, deg; the lowest and highest elevation, deg, that it `sees` in nearly all directions; the
-    `place` of the camera, ahead + i left of base_link, m; and the median error of points, px.
+    `place` of the camera, ahead + i left of base_link, m; and the median error of points, px of the
+    tracker.
     """
 
     name: str
@@ -105,7 +106,8 @@ def _require_enough(tracks: Tracks, odometry: Trajectory) -> None:
     if way < _LEAST_M:
         lacks.append(f'drive {_LEAST_M:.0f} m, not {way:.1f}')
     if turn < _LEAST_RAD:
-        lacks.append(f'turn by {np.degrees(_LEAST_RAD):.0f} degrees in all, not {turn:.0f}')
+        needed, turned = np.degrees([_LEAST_RAD, turn])
+        lacks.append(f'turn by {needed:.0f} degrees in all, not {turned:.0f}')
     if len(tracks) < _LEAST_POINTS:
         lacks.append(
             f'images show {len(tracks)} points that can be followed, {_LEAST_POINTS} are needed: '
@@ -241,7 +243,8 @@ class _Problem:
     def calibration(self, x: Array) -> LensCalibration:
         """Raises ConfigError for impossible values."""
         values = self.values(x)
-        mount = np.degrees([values[name] for name in ('roll', 'pitch', 'yaw')])
+        angles = np.array([values[name] for name in ('roll', 'pitch', 'yaw')])
+        mount = np.degrees(wrap_angle(angles))
         return replace(self.model.calibration(values), mount_rpy=tuple(mount.tolist()))
 
     def camera(self, x: Array) -> CameraModel:
@@ -272,10 +275,11 @@ class _Problem:
         return seen, _turned(directions, turn.conj())
 
     def errors(self, x: Array) -> Array:
-        """Where points should be seen, minus where they were (M, 2), px."""
+        """Where points should be seen, minus where they were (M, 2), px of the tracker."""
         camera, (seen, expected) = self.camera(x), self.rays(x)
         errors = _project(camera.lens, expected @ camera.rotation, self.tracks.pixels)
-        errors = np.where(np.isfinite(seen[:, :1]), errors - self.tracks.pixels, _UNSEEN_PX)
+        errors = (errors - self.tracks.pixels) * scale_of(self.size)
+        errors = np.where(np.isfinite(seen[:, :1]), errors, _UNSEEN_PX)
         return np.nan_to_num(errors, nan=_UNSEEN_PX)
 
     def residuals(self, x: Array) -> Array:

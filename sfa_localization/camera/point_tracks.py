@@ -73,7 +73,7 @@ def changing(samples: Sequence[Image]) -> Mask:
     return np.equal(enlarged, 0)
 
 
-def _scale_of(size: tuple[int, ...]) -> float:
+def scale_of(size: tuple[int, ...]) -> float:
     """Pixels of the images in which points are followed, per pixel of images of a size (H, W)."""
     return min(LONGEST_SIDE / max(size), 1.0)
 
@@ -85,7 +85,7 @@ def _gray(image: Image) -> Image:
 
 def _shrunk(image: Image, method: int = cv2.INTER_AREA) -> Image:
     """An image (H, W), no larger than the tracker needs it."""
-    scale = _scale_of(image.shape)
+    scale = scale_of(image.shape)
     size = round(image.shape[1] * scale), round(image.shape[0] * scale)
     return np.asarray(cv2.resize(image, size, interpolation=method), np.uint8)
 
@@ -125,7 +125,7 @@ class PointTracker:
 
     def __init__(self, cameras: Sequence[CameraModel], samples: Sequence[Image]) -> None:
         self.size = cameras[0].size
-        self._scale = _scale_of(self.size)
+        self._scale = scale_of(self.size)
         self._cameras = cameras
         self._changing = _shrunk(changing(samples).astype(np.uint8), cv2.INTER_NEAREST) > 0
         self._before: Image | None = None
