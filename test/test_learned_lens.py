@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lens of a camera, learned from a drive: from tracks of points that a known lens projects."""
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -161,7 +162,7 @@ def horizon_px(lens):
 @pytest.mark.slow
 def test_a_wrong_description_is_named_with_its_size_and_a_right_one_is_not(of_mirror):
     result, far = of_mirror, replace(MIRROR_LENS, cx=MIRROR_LENS.cx + 15.0)
-    true_px, turned = round(horizon_px(MIRROR_LENS)), replace(MIRROR_LENS, mount_rpy=(0.0,) * 3)
+    turned = replace(MIRROR_LENS, mount_rpy=(0.0,) * 3)
     polar = replace(EQUIANGULAR, angle_min=78.0, angle_max=114.0, mount_rpy=(0.0, 0.0, -40.0))
     said = {
         name: ' '.join(lens_report.contradictions(result, lens, 'camera.yaml'))
@@ -175,7 +176,8 @@ def test_a_wrong_description_is_named_with_its_size_and_a_right_one_is_not(of_mi
     assert said['right'] == ''
     assert '423, 296, the drive shows 408, 296 (+- ' in said['far']
     assert '40 degrees off' in said['turned'] and 'yaw of -40 degrees' in said['turned']
-    assert f'camera.yaml puts the horizon at 115 px, the drive shows {true_px}' in said['polar']
+    shown = re.search(r'puts the horizon at 115 px, the drive shows (\d+) \(', said['polar'])[1]
+    assert int(shown) == pytest.approx(horizon_px(MIRROR_LENS), abs=3.0)
 
 
 @pytest.mark.slow

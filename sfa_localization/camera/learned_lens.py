@@ -45,7 +45,7 @@ PLACE_STD_M = 0.03
 m."""
 _YAWS = np.radians(np.arange(0.0, 360.0, 22.5))  # from which the search starts
 _SEARCH_POINTS, _POINTS, _CELLS = 150, 450, 16  # spread over cells along the longer side of images
-_TRACKER_PX = 4.0  # standard deviation of a sighting, as those of a track err alike
+_TRACKER_PX = 16.0  # of a sighting, as those of many tracks err alike: the claimed errors are right
 _SMALL_PX = 1.0  # residuals beyond count linearly
 _SHARP = 2.5  # times the median residual, beyond which a point is left out
 _PASSES = 2  # of leaving out points

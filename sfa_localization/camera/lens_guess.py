@@ -20,7 +20,7 @@ from sfa_localization.data.errors import CameraError
 from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Image
 
-_CENTERED = 0.007  # of the radius: standard deviation of the lens's center about that of its rim
+_CENTERED = 0.004  # of the radius: standard deviation of the lens's center about that of its rim
 _UNCERTAIN = 0.03  # the same for a rim that is hardly visible
 _CLEAR_SUPPORT, _CLEAR_SHARE = 0.9, 0.95  # of a rim's directions; of its disc that changes
 _EDGE_STD = np.radians(20.0)  # of the elevation of an edge of a panorama

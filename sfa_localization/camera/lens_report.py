@@ -20,7 +20,7 @@ _BELOW_DEG = -3.0  # what lies lower shows by parallax where a robot is
 _LEAST_DEG, _CERTAIN = 1.5, 4.0  # of a difference: it matters, and exceeds so many deviations
 _LEAST_TURN_DEG = 3.0
 _WORSE = 0.25  # quantile of the cosine
-_BESIDE = 0.5  # sine of the elevations that panoramas show
+_BESIDE = 0.1  # sine of elevations at which a stretch of all hardly shows
 
 
 def sentence(lens: LearnedLens) -> str:
