@@ -17,6 +17,7 @@ from sfa_localization.camera.lenses import CameraModel, make_camera
 from sfa_localization.camera.point_tracks import changing
 from sfa_localization.camera.settings import LensCalibration
 from sfa_localization.data.errors import CameraError
+from sfa_localization.data.geometry import Mask
 from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Image
 
@@ -25,6 +26,7 @@ _UNCERTAIN = 0.03  # the same for a rim that is hardly visible
 _CLEAR_SUPPORT, _CLEAR_SHARE = 0.9, 0.95  # of a rim's directions; of its disc that changes
 _EDGE_STD = np.radians(20.0)  # of the elevation of an edge of a panorama
 _USUAL_EDGES = np.radians([-12.0, 24.0])
+_STILL = 0.2  # share of the area beyond a rim, or in a hole, that changes
 _CONTRAST = 0.05  # relative difference of brightness that tells the sky from the ground
 
 
@@ -55,7 +57,9 @@ class LensGuess:
             second = replace(second, column=second.column + width - height)
             return cls(kind.name, (first, second), base)
         circle = _circle(samples, *geometry.circles)
-        base = replace(base, radius_min=circle.hole, radius_max=circle.radius)
+        corner = float(np.hypot(height, width)) / 2
+        limit = circle.radius if circle.radius < corner else 0.0
+        base = replace(base, radius_min=circle.hole, radius_max=limit)
         return cls(kind.name, (circle,), base)
 
     @property
@@ -117,12 +121,26 @@ def _camera(model: LensModel, base: LensCalibration) -> CameraModel:
 
 
 def _circle(samples: Sequence[Image], circles: MirrorCircles) -> LensCircle:
-    """The rim with its hole; where no rim is clear, the center is uncertain."""
-    rim, hole = circles.rim, circles.hole.radius if circles.hole else 0.0
+    """The rim with its hole; the whole image where it is no rim, as things move beyond it."""
+    moves, rim, hole = changing(samples), circles.rim, circles.hole
+    height, width = moves.shape
+    hole_radius = hole.radius if hole and not _share(moves, hole, 0.0, 0.8) > _STILL else 0.0
+    if _share(moves, rim, 1.1, np.inf) > _STILL:
+        radius = float(np.hypot(height, width)) / 2
+        center = (width - 1) / 2, (height - 1) / 2
+        return LensCircle(*center, radius, _UNCERTAIN * radius, hole_radius)
     clear = _clear_rim(samples, rim)
     if clear is None:
-        return LensCircle(rim.column, rim.row, rim.radius, _UNCERTAIN * rim.radius, hole)
-    return LensCircle(*clear, _CENTERED * clear[2], hole)
+        return LensCircle(rim.column, rim.row, rim.radius, _UNCERTAIN * rim.radius, hole_radius)
+    return LensCircle(*clear, _CENTERED * clear[2], hole_radius)
+
+
+def _share(moves: Mask, circle: Circle, nearest: float, farthest: float) -> float:
+    """The share that moves (H, W) between two radii, given as multiples of that of a circle."""
+    rows, columns = np.mgrid[: moves.shape[0], : moves.shape[1]]
+    radius = np.hypot(columns - circle.column, rows - circle.row) / circle.radius
+    ring = moves[(radius >= nearest) & (radius < farthest)]
+    return float(ring.mean()) if ring.size else 0.0
 
 
 def rim_of(samples: Sequence[Image]) -> tuple[float, float, float] | None:
