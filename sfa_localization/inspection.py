@@ -164,6 +164,7 @@ class BagReport:
     image_topic: str = ''
     camera: kinds.CameraKind | None = None
     lens: str = ''
+    lens_title: str = 'lens'
     samples: list[Image] = field(default_factory=list)
     odometry_topic: str = ''
     odometry: Odometry | None = None
@@ -183,7 +184,7 @@ class BagReport:
         if self.camera is not None:
             facts['images'] = str(self.camera)
         if self.lens:
-            facts['lens'] = self.lens
+            facts[self.lens_title] = self.lens
         if self.odometry is not None:
             area = max(map(hull_area, self.drives), default=0.0)
             along = max(map(directions, self.drives), default=0)
@@ -282,6 +283,7 @@ def _see_lens(report: BagReport, recipe: ReadingRecipe) -> None:
     report.lens = lens_report.sentence(lens)
     report.notes += lens_report.advice(lens)
     if recipe.camera.is_described:
+        report.lens_title = 'lens as the drive shows it, beside the described one'
         report.notes += lens_report.contradictions(
             lens, recipe.unwrapper.calibration, recipe.camera.name
         )

@@ -177,8 +177,8 @@ def _learned(fit: _Fit, guess: LensGuess) -> LearnedLens:
     std = dict(zip(problem.names, np.sqrt(np.diag(problem.covariance(fit))).tolist(), strict=True))
     if error_px > _LARGEST_ERROR_PX or len(problem.tracks) < _LEAST_POINTS // 2:
         raise CameraError(
-            'the images do not move as those of any lens that is known: is this camera on the '
-            'robot of this odometry, and do both share a clock?'
+            'the images do not move as those of any lens that is known: does the camera see all '
+            'around, is it on the robot of this odometry, and do both share a clock?'
         )
     lens = problem.calibration(fit.x)
     has_one_center = len(guess.circles) == 1

@@ -35,7 +35,7 @@ def sentence(lens: LearnedLens) -> str:
     lean = np.hypot(wrapped_deg(roll), pitch)
     leans = f'leaning by {lean:.0f} degrees (+- {max(lens.lean_std, 1):.0f})' if lean >= 1.5 else ''
     low, high = lens.sees
-    sees = f'sees {low:.0f} to {high:.0f} degrees of elevation'
+    sees = f'sees about {low:.0f} to {high:.0f} degrees of elevation'
     return ', '.join(filter(None, [*parts, turned, leans, sees]))
 
 

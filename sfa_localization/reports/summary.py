@@ -44,7 +44,10 @@ def summary(trained: Trained) -> str:
         lines.append(
             f'heading: expect {quality["expected_yaw_error_deg"]:.1f} degrees mean error there'
         )
-    lines += [f'lens: {sentence(trained.lens)}'] if trained.lens else []
+    if trained.lens:
+        is_used = trained.lens.calibration == trained.model.lens
+        of = 'lens' if is_used else 'lens as the drive shows it, beside the described one in use'
+        lines.append(f'{of}: {sentence(trained.lens)}')
     lines += [*trained.model.rig.as_text(), *point_lines(quality)]
     for run, check in zip(trained.runs, trained.checks, strict=False):
         lines += [f'{run.name}: {text}' for text in check.wrong + check.corrected]
