@@ -266,3 +266,20 @@ def test_points_are_followed_in_rotating_images_and_not_beyond_the_rim(scale):
     assert np.hypot(*(tracks.pixels - center).T).max() < 120 * scale
     seen = changing(images)
     assert seen[side // 2, round(0.7 * side)] and not seen[0, 0]
+
+
+@pytest.mark.parametrize('has_rim', [True, False])
+def test_an_edge_in_the_scene_is_no_rim(has_rim):
+    """Things move on both sides of the edge of a lawn; beyond a rim nothing does."""
+    rows, columns = np.mgrid[:240, :320]
+    inside = (np.hypot(columns - 165.0, rows - 118.0) < 90)[..., None]
+    rng, samples = np.random.default_rng(5), []
+    for _ in range(8):
+        coarse = rng.integers(90, 250, (24, 32, 1), np.uint8).repeat(3, axis=2)
+        texture = cv2.resize(coarse, (320, 240))
+        beyond = 8 if has_rim else texture // 2
+        samples.append(np.where(inside, texture, beyond).astype(np.uint8))
+    (circle,) = LensGuess.of(samples).circles
+    expected = (165.0, 118.0, 90.0) if has_rim else (159.5, 119.5, 200.0)
+    assert (circle.column, circle.row, circle.radius) == pytest.approx(expected, abs=2.0)
+    assert LensGuess.of(samples).base.radius_max == (circle.radius if has_rim else 0.0)
