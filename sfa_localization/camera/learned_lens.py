@@ -52,7 +52,7 @@ _PASSES = 2  # of leaving out points
 _STARTS, _SEARCH_STEPS, _STEPS = 2, 15, 40  # of least squares
 _UNSEEN_PX = 50.0  # residual of a sighting that the camera cannot have
 _BLOCK = 10  # images whose errors of odometry are alike
-_LARGEST_ERROR_PX = 3.0  # median of a lens that fits: 0.6 in rendered gardens
+_LARGEST_ERROR_PX = 3.0  # median of a lens that fits: 0.5 to 1.2 in rendered gardens
 _LEAST_M, _LEAST_RAD, _LEAST_POINTS = 5.0, 2 * np.pi, 100
 _NEARLY_ALL = 0.95  # of the directions
 
@@ -262,23 +262,17 @@ class _Problem:
         lever = complex(values['ahead'], values['left']) * np.exp(1j * poses[:, 2])
         return poses[:, :2] + np.column_stack([lever.real, lever.imag]), poses[:, 2]
 
-    def rays(self, x: Array) -> tuple[Array, Array]:
-        """Rays (M, 3) in which points were seen, NaN where they cannot be, and those in which they
-        should be seen, both in the robot's axes.
-        """
+    def errors(self, x: Array) -> Array:
+        """Where points should be seen, minus where they were (M, 2), px of the tracker."""
         camera, tracks = self.camera(x), self.tracks
         places, yaw = self.poses(x)
         turn = np.exp(1j * yaw[tracks.image])
         seen = _unproject(camera.lens, tracks.pixels) @ camera.rotation.T
         valid = np.where(np.isfinite(seen[:, :1]), seen, [1.0, 0.0, 0.0])
         directions = triangulated(tracks.point, places[tracks.image], _turned(valid, turn))
-        return seen, _turned(directions, turn.conj())
-
-    def errors(self, x: Array) -> Array:
-        """Where points should be seen, minus where they were (M, 2), px of the tracker."""
-        camera, (seen, expected) = self.camera(x), self.rays(x)
-        errors = _project(camera.lens, expected @ camera.rotation, self.tracks.pixels)
-        errors = (errors - self.tracks.pixels) * scale_of(self.size)
+        expected = _turned(directions, turn.conj()) @ camera.rotation
+        errors = _project(camera.lens, expected, tracks.pixels) - tracks.pixels
+        errors *= scale_of(self.size)
         errors = np.where(np.isfinite(seen[:, :1]), errors, _UNSEEN_PX)
         return np.nan_to_num(errors, nan=_UNSEEN_PX)
 

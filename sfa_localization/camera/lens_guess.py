@@ -15,7 +15,7 @@ from sfa_localization.camera.calibration import Circle, MirrorCircles, find_circ
 from sfa_localization.camera.lens_models import LensCircle, LensModel
 from sfa_localization.camera.lenses import CameraModel, make_camera
 from sfa_localization.camera.point_tracks import changing
-from sfa_localization.camera.settings import LensCalibration
+from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.geometry import Mask
 from sfa_localization.data.rig import Quantity
@@ -25,7 +25,6 @@ _CENTERED = 0.004  # of the radius: standard deviation of the lens's center abou
 _UNCERTAIN = 0.03  # the same for a rim that is hardly visible
 _CLEAR_SUPPORT, _CLEAR_SHARE = 0.9, 0.95  # of a rim's directions; of its disc that changes
 _EDGE_STD = np.radians(20.0)  # of the elevation of an edge of a panorama
-_USUAL_EDGES = np.radians([-12.0, 24.0])
 _STILL = 0.2  # share of the area beyond a rim, or in a hole, that changes
 _CONTRAST = 0.05  # relative difference of brightness that tells the sky from the ground
 
@@ -75,7 +74,8 @@ class LensGuess:
             return [lens_models.dual_fisheye(base, self.circles, upside_down=bool(direction))]
         if not self.circles:
             base = replace(base, camera_model='equirectangular', mirrored=mirrored)
-            edges = [Quantity(edge, _EDGE_STD) for edge in _USUAL_EDGES.tolist()]
+            usual = PanoramaConfig().sphere
+            edges = [Quantity(edge, _EDGE_STD) for edge in (usual.low, usual.high)]
             edges = [] if self.kind == kinds.EQUIRECTANGULAR else edges
             return [lens_models.equirectangular(base, edges)]
         (circle,), other = self.circles, ('yes', 'no')[direction]
@@ -129,7 +129,7 @@ def _circle(samples: Sequence[Image], circles: MirrorCircles) -> LensCircle:
         radius = float(np.hypot(height, width)) / 2
         center = (width - 1) / 2, (height - 1) / 2
         return LensCircle(*center, radius, _UNCERTAIN * radius, hole_radius)
-    clear = _clear_rim(samples, rim)
+    clear = _clear_rim(moves, rim)
     if clear is None:
         return LensCircle(rim.column, rim.row, rim.radius, _UNCERTAIN * rim.radius, hole_radius)
     return LensCircle(*clear, _CENTERED * clear[2], hole_radius)
@@ -146,16 +146,16 @@ def _share(moves: Mask, circle: Circle, nearest: float, farthest: float) -> floa
 def rim_of(samples: Sequence[Image]) -> tuple[float, float, float] | None:
     """Column, row and radius, px, of a rim in images (H, W, 3) that is clear; None without."""
     try:
-        return _clear_rim(samples, find_circles(samples).rim)
+        return _clear_rim(changing(samples), find_circles(samples).rim)
     except CameraError:
         return None
 
 
-def _clear_rim(samples: Sequence[Image], rim: Circle) -> tuple[float, float, float] | None:
-    """The rim, or the smallest circle around what changes in images where that is clearer."""
+def _clear_rim(moves: Mask, rim: Circle) -> tuple[float, float, float] | None:
+    """The rim, or the smallest circle around what moves (H, W) where that is clearer."""
     if rim.support >= _CLEAR_SUPPORT:
         return rim.column, rim.row, rim.radius
-    rows, columns = np.nonzero(changing(samples))
+    rows, columns = np.nonzero(moves)
     if not len(rows):
         return None
     points = np.column_stack([columns, rows]).astype(np.float32)
