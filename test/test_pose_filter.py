@@ -14,7 +14,7 @@ from sfa_localization.data.error_correlation import LEAST_M, ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.rig import Quantity, Rig
-from sfa_localization.fusion.ekf import Ekf, with_delay
+from sfa_localization.fusion.ekf import Ekf, replaced
 from sfa_localization.fusion.motion import DELAY, LOSS, SCALE, SIZE, Pace, Twist
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
@@ -236,8 +236,8 @@ def test_a_delay_that_turns_contradict_gives_way_and_the_pose_follows():
     covariance[DELAY, DELAY] = covariance[0, DELAY] = covariance[DELAY, 0] = 0.05**2  # at 1 m/s
     blank = Ekf(FilterConfig(), ErrorCorrelation()).blank(SECOND)
     belief = blank._replace(mean=mean, covariance=covariance, located=True)
-    assert with_delay(belief, Quantity(0.1, 0.05)) is belief  # 1.4 standard deviations
-    after = with_delay(belief, Quantity(-0.3, 0.02))
+    assert replaced(belief, DELAY, Quantity(0.1, 0.05)) is belief  # 1.4 standard deviations
+    after = replaced(belief, DELAY, Quantity(-0.3, 0.02))
     assert after.mean[[0, DELAY]] == pytest.approx([-0.3, -0.3])
     assert after.covariance[[0, 0, DELAY], [0, DELAY, DELAY]] == pytest.approx(
         [1 + 0.02**2 - 0.05**2, 0.02**2, 0.02**2]

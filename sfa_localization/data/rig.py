@@ -21,6 +21,9 @@ from sfa_localization.data.messages import LARGEST_SCALE
 
 CAMERA_STD_M = 0.5
 """Prior of each coordinate of a camera on a robot of unknown size."""
+TURN_FACTOR_STD = 0.1
+"""Of true over counted turns, also of a known robot on other ground: tracks that skid on one roll
+on another, and the wheels of one robot counted 3 to 15 % too much."""
 UNKNOWN_YAW_STD = math.pi / math.sqrt(3)
 """Standard deviation, rad, of an angle that is uniform on the circle."""
 _LARGEST_LEVER_M = 5.0  # a camera of a ground robot sits nearer to the middle of its axle
@@ -41,7 +44,8 @@ class Rig:
 
     The camera sits `camera_ahead` and `camera_left` m of base_link, turned left by `camera_yaw` rad
     since the first drive; its images are stamped `camera_delay` s late. The robot drives
-    `wheel_scale` times the distance of its odometry, minus `turn_loss` m per radian of its turns.
+    `wheel_scale` times the distance of its odometry, minus `turn_loss` m per radian of its turns,
+    plus `speed_offset` m/s, and turns `turn_factor` times as far as the odometry.
     Raises DataError for impossible values.
     """
 
@@ -51,6 +55,8 @@ class Rig:
     camera_delay: Quantity = Quantity(0.0, 0.2)
     wheel_scale: Quantity = Quantity(1.0, 0.03)
     turn_loss: Quantity = Quantity(0.0, 0.05)
+    turn_factor: Quantity = Quantity(1.0, TURN_FACTOR_STD)
+    speed_offset: Quantity = Quantity(0.0, 0.005)
 
     def __post_init__(self) -> None:
         for name, (value, std) in self.items():
@@ -124,7 +130,7 @@ class Rig:
     def as_text(self) -> list[str]:
         """Lines for a terminal."""
         turned, delay = self.camera_yaw, self.camera_delay
-        scale, loss = self.wheel_scale, self.turn_loss
+        scale, loss, turn = self.wheel_scale, self.turn_loss, self.turn_factor
         ahead = _offset(self.camera_ahead, 'ahead of', 'behind')
         aside = _offset(self.camera_left, 'left of', 'right of')
         lines = [f'camera: {ahead} and {aside} base_link']
@@ -137,6 +143,10 @@ class Rig:
         lines.append(f'wheels: {scale.value:.4f} times the way counted (+- {scale.std:.4f})')
         if loss.value or loss.std:
             lines[-1] += f', less {loss.value:.3f} m per radian (+- {loss.std:.3f})'
+        offset = 1e3 * self.speed_offset.value, 1e3 * self.speed_offset.std
+        if offset[0]:
+            lines[-1] += ', plus {:.0f} mm/s (+- {:.0f})'.format(*offset)
+        lines.append(f'wheels: {turn.value:.3f} times the turns counted (+- {turn.std:.3f})')
         return lines
 
 

@@ -82,14 +82,15 @@ class PoseEvent(NamedTuple):
 class MeasurementEvent(NamedTuple):
     """A position (2,) or pose (3,) from an image, with its positive definite covariance.
 
-    `late` is the delay of the camera by the turns of the images, s, beyond the expected one; its
-    standard deviation is infinite before any turn.
+    By the turns of the images: `late` is the delay of the camera, s, beyond the expected one, and
+    `turn_factor` true over counted turns; before any turn, the standard deviations are infinite.
     """
 
     stamp_ns: int
     value: Array
     covariance: Array
     late: Quantity
+    turn_factor: Quantity = Quantity(1.0, math.inf)
 
 
 Event = OdometryEvent | PoseEvent | MeasurementEvent
@@ -206,7 +207,8 @@ class Memory(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """Everything that the next event changes. `located` is False before the first pose."""
+    """Everything that the next event changes. `located` is False before the first pose;
+    `counted_rad` is how far the odometry has turned, uncorrected."""
 
     stamp_ns: int
     mean: Array
@@ -219,6 +221,7 @@ class Belief(NamedTuple):
     memory: Memory
     path: DrivenPath = DrivenPath()
     pace: Pace = Pace()
+    counted_rad: float = 0.0
 
     @property
     def state(self) -> State | None:

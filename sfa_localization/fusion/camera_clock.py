@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""By how much the camera's stamps are late, from the turns that images and odometry both measure.
+"""By how much the camera's stamps are late, and how far the robot turns for each turn counted.
 
-The delay is the lag of the turns between images behind those of the odometry. No map is needed: it
-works from the first turns on.
+Images and odometry both measure turns: the delay is the lag of those between images behind those of
+the odometry, the factor their ratio. No map is needed: it works from the first turns on.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from sfa_localization.data.events import (
     merge_by_stamp,
     whole_leap,
 )
-from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Odometry, Stamps
 
 NEAR_NS = 150_000_000
@@ -33,6 +34,9 @@ _GRID = np.arange(-round(CLOCK_RANGE_S / _STEP_S), round(CLOCK_RANGE_S / _STEP_S
 _PAIR_NS, _PAUSE_NS = 1_000_000_000, 500_000_000  # pairs with longer ones between are left out
 # An estimate applies to images stamped so much later, whichever message came first.
 _IN_TRANSIT_NS, _REMEMBERED_NS = 1_000_000_000, 10_000_000_000
+_FACTORS: Array = np.exp(np.linspace(-0.75, 0.75, 11))
+"""True over counted turns: tracks skid, by half at most."""
+_SIGNED: Array = np.concatenate([_FACTORS, -_FACTORS])[:, None]  # columns may grow either way
 _WINDOW_NS = round(CLOCK_RANGE_S * 1e9) + 100_000_000
 # Residuals beyond _OUTLIER times _SCALE_RAD are mismatches, and clipped; delays whose costs differ
 # by less than _ALIKE fit equally well.
@@ -48,7 +52,8 @@ _MEAN_OF_NORMAL = 0.798  # of |x|: sqrt(2 / pi)
 
 @dataclass(frozen=True, slots=True)
 class CameraClock:
-    """`delay_s` by which images are stamped later than odometry, with its standard deviation.
+    """`delay_s` by which images are stamped later than odometry, with its standard deviation, and
+    the `turn_factor`: true over counted turns.
 
     0 with infinite standard deviation until a turn has begun and ended. An `assumed` delay is used
     even where it is smaller than its standard deviation.
@@ -57,6 +62,7 @@ class CameraClock:
     delay_s: float = 0.0
     std_s: float = np.inf
     assumed: bool = False
+    turn_factor: Quantity = Quantity(1.0, np.inf)
 
     @property
     def is_estimated(self) -> bool:
@@ -84,9 +90,11 @@ class CameraClockFinder:
         self._driven: deque[tuple[int, float]] = deque()
         self._last: tuple[int, float] | None = None
         self._pairs: deque[tuple[int, int, float]] = deque()
-        # By the sign of the columns and the delay: cost, its curvature, and of the pairs with
-        # turns their number, their size and their residuals.
-        self._cost, self._power, self._turns, self._size, self._error = np.zeros((5, 2, len(_GRID)))
+        # By signed factor and delay: cost, its curvature by the delay and by the factor, its slope
+        # by the factor, and of the pairs with turns their number, their size and their residuals.
+        sums = np.zeros((7, len(_SIGNED), len(_GRID)))
+        self._cost, self._power, self._square, self._pull = sums[:4]
+        self._turns, self._size, self._error = sums[4:]
 
     @property
     def clock(self) -> CameraClock:
@@ -132,13 +140,17 @@ class CameraClockFinder:
         if first < stamps_ns[0] or np.any((first <= pauses_ns) & (pauses_ns <= last)):
             return
         seconds, span = (stamps_ns - start_ns) * 1e-9, (stop_ns - start_ns) * 1e-9
-        driven = np.interp(span - _GRID, seconds, yaw) - np.interp(-_GRID, seconds, yaw)
-        residual = np.abs(wrap_angle(np.array([[turn], [-turn]]) - driven)) / _SCALE_RAD
-        limited, turning = np.minimum(residual, _OUTLIER), np.abs(driven) > _TURN_RAD
+        counted = np.interp(span - _GRID, seconds, yaw) - np.interp(-_GRID, seconds, yaw)
+        driven = _SIGNED * counted
+        signed = np.asarray(wrap_angle(turn - driven)) / _SCALE_RAD
+        residual, turning = np.abs(signed), np.abs(driven) > _TURN_RAD
+        limited, near = np.minimum(residual, _OUTLIER), residual < _OUTLIER
         for total, new in (
             (self._cost, limited),
             # The derivative of a turn by the delay is the difference of the turn rates at its ends.
-            (self._power, (residual < _OUTLIER) * np.gradient(driven, _STEP_S) ** 2),
+            (self._power, near * np.gradient(driven, _STEP_S, axis=1) ** 2),
+            (self._square, near * counted**2),
+            (self._pull, near * signed * _SCALE_RAD * np.sign(_SIGNED) * counted),
             (self._turns, turning),
             (self._size, turning * np.abs(driven)),
             (self._error, turning * limited * _SCALE_RAD),
@@ -149,7 +161,8 @@ class CameraClockFinder:
         if estimate.is_estimated:
             agrees = abs(estimate.delay_s - start.delay_s) <= SIGNIFICANT_STDS * estimate.std_s
             if start.assumed and agrees:
-                estimate = CameraClock(start.delay_s, min(start.std_s, estimate.std_s), True)
+                std_s = min(start.std_s, estimate.std_s)
+                estimate = CameraClock(start.delay_s, std_s, True, estimate.turn_factor)
             self._estimates.append((last, estimate))
         while len(self._estimates) > 2 and self._estimates[1][0] < last - _REMEMBERED_NS:
             self._estimates.popleft()
@@ -158,7 +171,6 @@ class CameraClockFinder:
         """The delay of the least cost, unless it lies at the border or the turns do not fix it."""
         side, best = np.unravel_index(int(np.argmin(self._cost)), self._cost.shape)
         turns, size, error = (a[side, best] for a in (self._turns, self._size, self._error))
-        # Columns may grow clockwise or counterclockwise: the better sign is the right one.
         if turns < _TURNS_MIN or error > size / 2 or not 0 < best < len(_GRID) - 1:
             return CameraClock()
         scale = max(error / turns / _MEAN_OF_NORMAL, _SCALE_MIN_RAD)
@@ -172,7 +184,10 @@ class CameraClockFinder:
         # Two slopes meet in the minimum of a sum of absolute values.
         steepest = max(below - least, above - least)
         part = (below - above) / (2 * steepest) if steepest > 0 else 0.0
-        return CameraClock(float(_GRID[best] + part * _STEP_S), float(std))
+        square = max(float(self._square[side, best]), 1e-12)
+        factor = abs(float(_SIGNED[side, 0])) + float(self._pull[side, best]) / square
+        turn_factor = Quantity(factor, float(_CAUTION * scale / np.sqrt(square)))
+        return CameraClock(float(_GRID[best] + part * _STEP_S), float(std), False, turn_factor)
 
 
 class ImageClock:

@@ -42,6 +42,8 @@ GATE = {2: 13.815510557964274, 3: 16.26623619623813}
 OUTLYING = {2: 3.2188758248682006, 3: 4.641627676087445}
 """Squared distances, by dimensions, that one right measurement in a thousand, and in five, exceeds
 (chi-square). Those beyond the first are rejected, those beyond the second lose weight."""
+LEAST_STD = 1e-3
+"""Of a delay, s, or a turn factor, before turns contradict it."""
 ALIKE_SHARE = 0.2
 """Where neighbors share less of their errors, positions are those of a sensor without outliers."""
 
@@ -53,13 +55,13 @@ class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
         super().__init__(SIZE, 3)
 
     def predicted(self, belief: Belief, step: Step) -> Array:
-        """Covariance (12, 12) after a prediction: F P F^T + Q."""
+        """Covariance (14, 14) after a prediction: F P F^T + Q."""
         return step.jacobian @ belief.covariance @ step.jacobian.T + step.noise
 
     def corrected(
         self, belief: Belief, z: Array, jacobian: Array, noise: Array
     ) -> tuple[Array, Array, float]:
-        """Mean (12,), covariance (Joseph form) and squared Mahalanobis distance of the innovation,
+        """Mean (14,), covariance (Joseph form) and squared Mahalanobis distance of the innovation,
         which stays in `y`, its covariance in `S`.
         """
         self.x, self.P = belief.mean, belief.covariance
@@ -97,10 +99,12 @@ class Ekf:
         """
         speed_std, rate_std, rig = self._config.speed_std, self._config.rate_std, self._rig
         scale_std = rig.wheel_scale.std / rig.wheel_scale.value
-        of_robot = motion.BIAS_STD, scale_std, rig.turn_loss.std, rig.camera_delay.std
+        of_wheels = scale_std, rig.turn_loss.std, rig.turn_factor.std, rig.speed_offset.std
+        of_robot = motion.BIAS_STD, *of_wheels, rig.camera_delay.std
         covariance = np.diag(np.square([1, 1, 1, speed_std, rate_std, *of_robot, 1, 1, 1]))
         mean = np.zeros(SIZE)
-        mean[motion.LOSS] = rig.turn_loss.value
+        mean[motion.LOSS], mean[motion.OFFSET] = rig.turn_loss.value, rig.speed_offset.value
+        mean[motion.TURN] = rig.turn_factor.value - 1.0
         twist = Twist(0.0, 0.0, speed_std**2, rate_std**2)
         nowhere = (0.0, 0.0, 0.0)
         return Belief(stamp_ns, mean, covariance, False, nowhere, 0.0, twist, Odometer(), Memory())
@@ -114,7 +118,9 @@ class Ekf:
             placed = _at_pose(belief, event.pose, event.covariance, 0.0)
             path = belief.path._replace(placed_m=(-math.inf,))
             return placed._replace(memory=Memory(), path=path)
-        return self._measured(with_delay(belief, event.late), event)
+        belief = replaced(belief, motion.DELAY, event.late)
+        factor = Quantity(event.turn_factor.value - 1.0, event.turn_factor.std)
+        return self._measured(replaced(belief, motion.TURN, factor), event)
 
     # Predict.
 
@@ -135,10 +141,14 @@ class Ekf:
             belief = self.coast(belief, event.stamp_ns)
             twists = event.twist, event.twist
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
+        coasted_s = (belief.stamp_ns - (last.stamp_ns or belief.stamp_ns)) * 1e-9
+        counted_rad = belief.counted_rad + twists[0].omega * dt
+        counted_rad += belief.twist.omega * max(coasted_s, 0.0)
         step = motion.drive(belief.mean, twists[0], dt, self._noise, twists[1])
         odometry = received(belief, event)
         moved = self._moved(belief, event.stamp_ns, step)
         pace = belief.pace.after(event.stamp_ns, twists[1])
+        moved = moved._replace(counted_rad=counted_rad)
         return moved._replace(twist=twists[1], odometry=odometry, pace=pace)
 
     def _broken(self, belief: Belief, event: OdometryEvent, leap: Jump) -> Belief:
@@ -273,19 +283,19 @@ class Ekf:
         return placed._replace(memory=memory, path=path)
 
 
-def with_delay(belief: Belief, late: Quantity) -> Belief:
-    """The delay by the turns of the images replaces the state's where they contradict each other.
-    The rest of the state follows by its regression on the delay (Jeffrey's rule).
+def replaced(belief: Belief, row: int, by_turns: Quantity) -> Belief:
+    """What the turns of the images show replaces a row of the state where both contradict each
+    other. The rest of the state follows by its regression on that row (Jeffrey's rule).
     """
-    variance = max(float(belief.covariance[DELAY, DELAY]), motion.DELAY_WALK**2)
-    change = late.value - float(belief.mean[DELAY])
-    if abs(change) <= SIGNIFICANT_STDS * math.hypot(late.std, math.sqrt(variance)):
+    variance = max(float(belief.covariance[row, row]), LEAST_STD**2)
+    change = by_turns.value - float(belief.mean[row])
+    if abs(change) <= SIGNIFICANT_STDS * math.hypot(by_turns.std, math.sqrt(variance)):
         return belief
-    by_delay = belief.covariance[DELAY] / variance
-    by_delay[DELAY] = 1.0
-    mean = belief.mean + by_delay * change
+    by_row = belief.covariance[row] / variance
+    by_row[row] = 1.0
+    mean = belief.mean + by_row * change
     mean[YAW] = wrap_angle(mean[YAW])
-    covariance = belief.covariance + (late.std**2 - variance) * np.outer(by_delay, by_delay)
+    covariance = belief.covariance + (by_turns.std**2 - variance) * np.outer(by_row, by_row)
     return belief._replace(mean=mean, covariance=covariance)
 
 

@@ -21,7 +21,7 @@ POSITION_STD = 0.3
 """Standard deviation (m) of a measurement whose message has no covariance."""
 YAW_STD_LIMIT = 1.0
 """A heading less certain than this (rad) is left out: its error is not Gaussian any more."""
-COMMAND_RATE_STD = 0.2
+COMMAND_RATE_STD = 0.1
 """Of a turn rate that was commanded, rad/s: robots turn at half of it, by a third more or less."""
 _UNKNOWN_STDS = np.array([POSITION_STD, POSITION_STD, 0.2])  # m, m, rad
 # Least standard deviations: drivers understate what encoders resolve (m/s, rad/s), and no map from

@@ -7,15 +7,19 @@ h = omega dt / 2 and the chord c = v dt sin(h) / h, constant v and omega lead fr
 
     x' = x + c cos(yaw + h)    y' = y + c sin(yaw + h)    yaw' = yaw + omega dt
 
-The state has nine components more than a pose:
+The state has eleven components more than a pose:
 
-- V, OMEGA: speed m/s and turn rate rad/s of the robot. Odometry replaces them:
-  v = (1 + scale) v_odometry - loss |omega_odometry|, omega = omega_odometry - bias (`drive`).
+- V, OMEGA: speed m/s and turn rate rad/s of the robot. Odometry replaces them (`drive`):
+  v = (1 + scale) v_odometry - loss |omega_odometry| + offset,
+  omega = (1 + turn) omega_odometry - bias.
 - BIAS: what the odometry's turn rate reads too much, rad/s; a random walk in time.
 - SCALE: true speed over wheel speed, minus 1; a random walk over the distance (augmented Kalman
   filter: Larsen et al., ICRA 1998).
 - LOSS: way that wheels lose in a turn, m per radian; a random walk over the angle. Four small
   robots lost 0.07 to 0.1.
+- TURN: true turns over those of the odometry, minus 1; a random walk over the angle. Eleven real
+  logs had -0.09 to 0, tracks that skid -0.3.
+- OFFSET: what the wheels' speed reads too little, m/s; a random walk in time.
 - DELAY: by how much images are stamped later than expected, s; a random walk in time. An image
   shows the robot as it was that long ago; turns distinguish this from an error of the pose.
 - ERROR (3): the error that images of one place share, in standard deviations of the measurement:
@@ -33,14 +37,15 @@ import numpy as np
 
 from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, wrap_angle
 
-X, Y, YAW, V, OMEGA, BIAS, SCALE, LOSS, DELAY, ERROR = range(10)
-SIZE = 12
+X, Y, YAW, V, OMEGA, BIAS, SCALE, LOSS, TURN, OFFSET, DELAY, ERROR = range(12)
+SIZE = 14
 TURN_RADIUS_M = 0.25  # one radian of turning counts as this way: half the track of a small robot
 YAW_PER_METER = 0.005  # rad per sqrt(m): turns that wheels do not show
 ODOMETRY_CORRELATION_S = 0.1  # readings err alike for the time constant of a wheel controller
-BIAS_WALK, SCALE_WALK, LOSS_WALK, DELAY_WALK = 1e-4, 1e-3, 1e-3, 1e-3
+BIAS_WALK, SCALE_WALK, LOSS_WALK, TURN_WALK, OFFSET_WALK, DELAY_WALK = 1e-4, *[1e-3] * 3, 1e-4, 1e-3
 """Random walks: turn-rate bias of a cheap gyroscope, rad/s per sqrt(s); wheel scale, 1/sqrt(m), a
-percent over 100 m; loss in turns, m/rad per sqrt(rad); delay of the camera, s per sqrt(s)."""
+percent over 100 m; loss in turns, m/rad per sqrt(rad); turn factor, 1/sqrt(rad); offset of the
+speed, m/s per sqrt(s); delay of the camera, s per sqrt(s)."""
 PRIOR_CHANGE, CHANGES = 1.0, 100
 """Square of the change of speed (m/s) and turn rate (rad/s) in a second before any is observed,
 that of a hasty robot: it counts as one of the last CHANGES seconds of driving. Seven robots changed
@@ -53,7 +58,7 @@ _STRAIGHT_RAD = 1e-4  # half turns below this are summed as series, exact to rou
 
 
 class State(NamedTuple):
-    """Estimate at one stamp: `mean` (12,) and `covariance` (12, 12), in the order of X to ERROR."""
+    """Estimate at one stamp: `mean` (14,) and `covariance` (14, 14), in the order of X to ERROR."""
 
     stamp_ns: int
     mean: Array
@@ -95,6 +100,11 @@ class State(NamedTuple):
         return float(self.mean[LOSS])
 
     @property
+    def turn_factor(self) -> float:
+        """True turns over those of the odometry."""
+        return 1.0 + float(self.mean[TURN])
+
+    @property
     def position_std(self) -> float:
         """Standard deviation along the worst direction, m."""
         return math.sqrt(max(float(np.linalg.eigvalsh(self.covariance[:2, :2])[1]), 0.0))
@@ -105,7 +115,7 @@ class State(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A prediction: the new mean (12,), its Jacobian (12, 12), the noise it adds (12, 12)."""
+    """A prediction: the new mean (14,), its Jacobian (14, 14), the noise it adds (14, 14)."""
 
     mean: Array
     jacobian: Array
@@ -194,33 +204,34 @@ def drive(
     """Move by odometry: `twist`, held over the last `dt` seconds. It becomes the state's v and
     omega, or the twist of `now` does.
 
-    The columns of the old v and omega in the Jacobian vanish; those of bias, scale and loss follow
+    The columns of the old v and omega in the Jacobian vanish; those of the odometry's errors follow
     by the chain rule from v' and omega'. Each reading adds noise of its variance in the same way.
     """
     if not twist.moves:
         return _stand(mean)
-    v, omega, by_loss = _corrected(mean, twist)
+    by_errors = _by_errors(mean, twist)
+    v, omega = (twist[:2] + by_errors @ mean[BIAS:DELAY]).tolist()
     step = _advance(mean, v, omega, twist, dt, noise)
     by_twist = step.jacobian[:BIAS, V:BIAS].copy()
     step.jacobian[:BIAS, V:BIAS] = 0.0
-    step.jacobian[:BIAS, BIAS:DELAY] = by_twist @ [[0.0, twist.v, by_loss], [-1.0, 0.0, 0.0]]
+    step.jacobian[:BIAS, BIAS:DELAY] = by_twist @ by_errors
     variances = np.diag([twist.v_variance, twist.omega_variance])
     step.noise[:BIAS, :BIAS] += by_twist @ variances @ by_twist.T
     if now is not None:
-        step.mean[V], step.mean[OMEGA], by_loss_now = _corrected(mean, now)
-        step.jacobian[V, SCALE] += now.v - twist.v
-        step.jacobian[V, LOSS] += by_loss_now - by_loss
+        by_errors = _by_errors(mean, now)
+        step.mean[V:BIAS] = now[:2] + by_errors @ mean[BIAS:DELAY]
+        step.jacobian[V:BIAS, BIAS:DELAY] = by_errors
     return step
 
 
-def _corrected(mean: Array, twist: Twist) -> tuple[float, float, float]:
-    """Speed and turn rate by a reading, and the derivative of the speed by the loss."""
-    loss, by_loss = float(mean[LOSS]), 0.0
-    # A loss slows a robot down, but turns no motion around.
-    if abs(twist.v) > max(SPOT_RADIUS_M, 2 * abs(loss)) * abs(twist.omega):
-        by_loss = -math.copysign(abs(twist.omega), twist.v)
-    v = (1.0 + float(mean[SCALE])) * twist.v + by_loss * loss
-    return v, twist.omega - float(mean[BIAS]), by_loss
+def _by_errors(mean: Array, twist: Twist) -> Array:
+    """Derivatives (2, 5) of speed and turn rate by BIAS to OFFSET, in which they are linear."""
+    by_loss = offset = 0.0
+    # A loss slows a robot down, but turns no motion around; what turns on the spot does not drive.
+    if abs(twist.v) > max(SPOT_RADIUS_M, 2 * abs(float(mean[LOSS]))) * abs(twist.omega):
+        by_loss, offset = -math.copysign(abs(twist.omega), twist.v), 1.0
+    rows = [0.0, twist.v, by_loss, 0.0, offset], [-1.0, 0.0, 0.0, twist.omega, 0.0]
+    return np.array(rows)
 
 
 def coast(mean: Array, twist: Twist, dt: float, noise: MotionNoise, changes: Array) -> Step:
@@ -274,7 +285,8 @@ def _advance(
     jacobian[:3, V:BIAS] = by_twist
     slip = noise.slip_per_meter**2 * meters
     yaw = YAW_PER_METER**2 * meters + noise.yaw_per_radian**2 * radians
-    walks = np.square([BIAS_WALK, SCALE_WALK, LOSS_WALK, DELAY_WALK]) * [dt, meters, radians, dt]
+    walks = np.square([BIAS_WALK, SCALE_WALK, LOSS_WALK, TURN_WALK, OFFSET_WALK, DELAY_WALK])
+    walks *= [dt, meters, radians, radians, dt, dt]
     added = np.diag([slip, slip, yaw, 0, 0, *walks, *[1 - fade * fade] * 3])
     # Readings err alike for a while, which does not average out with the rate of the messages: over
     # dt it moves the pose as a constant error of variance (variance * time / dt) would.

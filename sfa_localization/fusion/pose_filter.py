@@ -174,7 +174,7 @@ class PoseFilter:
         driven = self._history.add((stamp_ns, ODOMETRY), OdometryEvent(stamp_ns, twist, scaled))
         if driven.odometry.stamp_ns == stamp_ns:
             for clock in self._camera, self._images:
-                clock.add_odometry(stamp_ns, driven.dead_reckoned[2])
+                clock.add_odometry(stamp_ns, driven.counted_rad)
         return ''
 
     def _path_pose(
@@ -219,7 +219,7 @@ class PoseFilter:
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
-        event = MeasurementEvent(taken_ns, fused, noise, late)
+        event = MeasurementEvent(taken_ns, fused, noise, late, clock.turn_factor)
         update = self._history.add((taken_ns, MEASUREMENT), event).memory.update
         assert update is not None
         self.counts[f'measurement: {update.reason}'] += 1

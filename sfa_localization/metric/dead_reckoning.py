@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, Complex, Indices, Mask, wrap_angle
+from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Count, Odometry, Stamps, YawRate, differences
 from sfa_localization.metric.settings import SegmentConfig
 
@@ -20,28 +21,31 @@ GAP_MAX_S = 0.5
 """Longer pauses of odometry or gyroscope are breaks: the robot may have been moved meanwhile."""
 # Pauses are longer than so many periods of the odometry.
 _PERIODS = 2.5
-# A shorter pause is bridged where the twists before and after differ by less.
-_BRIDGE_MAX_S, _UNSURE_M, _UNSURE_RAD = 1.5, 0.05, 0.1
+BRIDGE_MAX_S = 1.5
+"""A shorter pause is bridged: the robot moved by a twist between those before and after."""
 
 TURN_SLIDE = 0.05
 """m per rad: how far wheels slide sideways in a turn on the spot."""
-SEEN_TURN_SLIDE = 0.01
-"""m per rad: what remains of it where images correct the turns; 0.007 for two real indoor robots.
-With more, the links are so weak that maps shrink by 4 %."""
 
 
 class Way(NamedTuple):
     """The correction of a drive's wheels: distance = `scale` * counted - `loss` (m per radian) *
-    turned; `loss_std` is the standard deviation of the loss.
+    turned + `offset` (m/s) * time.
     """
 
     scale: float = 1.0
-    loss: float = 0.0
-    loss_std: float = 0.0
+    loss: Quantity = Quantity(0.0, 0.0)
+    offset: Quantity = Quantity(0.0, 0.0)
 
     def scaled(self, factor: float) -> Way:
         """The same way after a change of the meter."""
-        return Way(factor * self.scale, factor * self.loss, factor * self.loss_std)
+        loss, offset = (Quantity(factor * each.value, factor * each.std) for each in self[1:])
+        return Way(factor * self.scale, loss, offset)
+
+    @property
+    def values(self) -> Array:
+        """Factors (3,) of the columns of `OdometryTrack.ways`."""
+        return np.array([self.scale, self.loss.value, self.offset.value])
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +61,8 @@ class OdometryTrack:
     yaw_variance: Array
     """(N,) rad^2 since the start, without a bias of the yaw rate."""
     count: Count
-    slide: float = TURN_SLIDE
-    """m per rad turned: error of the places."""
+    bridged: Array
+    """(N, 2) variances of the way ahead, m^2, and of the turns, rad^2, in bridged pauses."""
     lever: complex = 0.0
     """Where the camera sits on the robot, ahead + i left, m."""
 
@@ -75,17 +79,21 @@ class OdometryTrack:
         breaks |= np.diff(odometry.part) != 0
         yaw, variances = np.unwrap(odometry.poses[:, 2]), odometry.variances[:, 1]
         poses = np.column_stack([odometry.poses[:, :2], yaw])
-        if config.yaw_source != 'odometry' and yaw_rate and len(yaw_rate.stamps_ns) > 1:
+        by_gyro = config.yaw_source != 'odometry' and bool(yaw_rate and len(yaw_rate.stamps_ns) > 1)
+        if by_gyro:
+            assert yaw_rate is not None
             turns, variances = _gyro_turns(odometry, ~breaks, yaw_rate, skipped)
             yaw = yaw[0] + summed(turns)
         elif config.yaw_source == 'gyro':
             raise DataError('yaw_source is gyro, but there is no yaw rate: name the imu topic')
         dt = np.diff(stamps) * 1e-9
         stated = variances[:-1] * dt**2
-        noise = np.where(stated > 0, stated, config.yaw_noise**2 * dt)
+        unsure = bridged(odometry) * [1.0, not by_gyro]
+        noise = np.where(stated > 0, stated, config.yaw_noise**2 * dt) + unsure[:, 1]
         part = summed(breaks).astype(np.int64)
         count = Count(len(stamps), dict(+skipped))
-        return cls(stamps, poses, part, summed(noise), count)._turned(yaw)
+        sums = np.vstack([np.zeros(2), np.cumsum(unsure, axis=0)])
+        return cls(stamps, poses, part, summed(noise), count, sums)._turned(yaw)
 
     @property
     def seconds(self) -> Array:
@@ -113,28 +121,32 @@ class OdometryTrack:
         """Turned in either direction since the start (N,), rad."""
         return summed(np.abs(np.diff(self.yaw)))
 
-    def corrected(self, stamps_ns: Stamps, yaw: Array, noise: float) -> OdometryTrack:
+    def corrected(self, stamps_ns: Stamps, yaw: Array, variance: Array) -> OdometryTrack:
         """The same wheel steps, with `yaw` (M,) rad added at stamps (M,), linear between them; the
-        turns then have this noise, rad per square root of s.
+        turns then have a `variance` (M,) rad^2 since the first of these.
         """
         at = (stamps_ns - self.stamps_ns[0]) * 1e-9
         track = self._turned(self.yaw + np.interp(self.seconds, at, yaw))
-        return replace(track, yaw_variance=noise**2 * self.seconds, slide=SEEN_TURN_SLIDE)
+        variance = np.interp(self.seconds, at, variance)
+        return replace(track, yaw_variance=variance)
 
     def driven(self, way: Way) -> OdometryTrack:
         """The same turns with the corrected way."""
-        return self._moved(way.scale * self.steps() - way.loss * self.way_per_loss(), self.yaw)
+        return self._moved(self.ways() @ way.values, self.yaw)
 
     def steps(self) -> Complex:
         """Displacements (N - 1,) m of base_link between the stamps."""
         return np.asarray(np.diff(self.poses[:, 0] + 1j * self.poses[:, 1]))
 
-    def way_per_loss(self) -> Complex:
-        """Displacements (N - 1,) m that a loss of 1 m per radian takes from the steps."""
+    def ways(self) -> Complex:
+        """Displacements (N - 1, 3) m by the steps, a loss of 1 m per radian, an offset of 1 m/s."""
         step, turned = self.steps(), np.abs(np.diff(self.yaw))
         length = np.abs(step)
         moves = length > SPOT_RADIUS_M * turned
-        return np.asarray(np.divide(step * turned, length, out=np.zeros_like(step), where=moves))
+        ahead = np.divide(step, length, out=np.zeros_like(step), where=moves)
+        backward = np.real(ahead * np.exp(-1j * self.yaw[:-1])) < 0
+        forward = np.where(backward, -ahead, ahead)
+        return np.column_stack([step, -turned * ahead, np.diff(self.seconds) * forward])
 
     def _turned(self, yaw: Array) -> OdometryTrack:
         """The same wheel steps driven with another yaw (N,)."""
@@ -162,16 +174,26 @@ def spaced(sums: Array, least: float) -> Indices:
 
 
 def pauses(odometry: Odometry) -> Mask:
-    """Mask (N - 1,) of the pauses of odometry; short ones with equal twists before and after do not
-    count: drivers that publish only when a command changes pause like that.
+    """Mask (N - 1,) of the pauses of odometry that are too long to be bridged."""
+    dt = np.diff(odometry.stamps_ns) * 1e-9
+    return np.asarray(_paused(dt) & (dt >= BRIDGE_MAX_S))
+
+
+def bridged(odometry: Odometry) -> Array:
+    """Variances (N - 1, 2) of the way, m^2, and of the turn, rad^2, in the pauses that are bridged:
+    0 where the twists before and after are equal, as of drivers that publish changes of commands.
     """
     twists, poses = odometry.twists, odometry.poses
     twists = twists if twists.any() else differences(odometry.stamps_ns, poses)
     dt = np.diff(odometry.stamps_ns) * 1e-9
-    gap = dt > max(GAP_MAX_S, _PERIODS * float(np.median(dt)))
-    unsure = np.abs(np.diff(twists, axis=0)) * dt[:, None]
-    alike = (unsure[:, 0] < _UNSURE_M) & (unsure[:, 1] < _UNSURE_RAD)
-    return np.asarray(gap & ~(alike & (dt < _BRIDGE_MAX_S)))
+    change = np.diff(twists, axis=0)
+    pause = _paused(dt) & (dt < BRIDGE_MAX_S) & change.any(axis=1)
+    unsure = change**2 + np.mean(twists**2, axis=0)  # or another twist of this robot
+    return np.asarray(np.where(pause[:, None], unsure * dt[:, None] ** 2, 0.0))
+
+
+def _paused(dt: Array) -> Mask:
+    return np.asarray(dt > max(GAP_MAX_S, _PERIODS * float(np.median(dt))))
 
 
 def _gyro_turns(

@@ -16,7 +16,7 @@ import numpy as np
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.rig import Quantity, Rig
+from sfa_localization.data.rig import TURN_FACTOR_STD, Quantity, Rig
 from sfa_localization.data.run import Points, Run, Stamps
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.keyframes.closures import Closures, Textures
@@ -30,11 +30,12 @@ from sfa_localization.metric.measured_points import MeasuredPoints, Settled, set
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.motion_sources import compare_map
 from sfa_localization.metric.mount import MOUNTED_ANEW_RAD, Mount
-from sfa_localization.metric.odometry_errors import Headings, corrections, way_of
+from sfa_localization.metric.odometry_errors import way_of
 from sfa_localization.metric.pose_graph import Graph, graph_poses
 from sfa_localization.metric.segments import Segments, cut_track, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.turned_maps import TurnedMaps
+from sfa_localization.metric.turns import Headings, estimated
 
 Maps = tuple[MetricResult, TurnedMaps | None, MetricResult]
 """The first map, turned maps, and the map of these, or the first again."""
@@ -87,12 +88,21 @@ class Drives:
         """Dead reckoning of each drive, with the turns of its images where these are better."""
         runs = [drive.run for drive in self.items]
         tracks = [OdometryTrack.of(run.odometry, self.config, run.yaw_rate) for run in runs]
-        better = corrections(self._headings(tracks), self.closures)
-        if better is None:
+        turns = estimated(self._headings(tracks))
+        if turns is None:
             return tracks
-        yaws, noise = better
-        changes = zip(tracks, self.items, yaws, strict=True)
-        return [track.corrected(drive.stamps_ns, yaw, noise) for track, drive, yaw in changes]
+        changes = zip(tracks, self.items, turns, strict=True)
+        return [
+            track.corrected(drive.stamps_ns, each.add, each.variance)
+            for track, drive, each in changes
+        ]
+
+    def turn_factors(self) -> list[Quantity]:
+        """Of each drive, true turns over those of the odometry, by images; none if these do not
+        show them."""
+        config = replace(self.config, yaw_source='odometry')
+        tracks = [OdometryTrack.of(drive.run.odometry, config) for drive in self.items]
+        return [each.factor for each in estimated(self._headings(tracks)) or []]
 
     def _headings(self, tracks: Sequence[OdometryTrack]) -> list[Headings]:
         pairs = zip(tracks, self.items, strict=True)
@@ -164,26 +174,45 @@ class Drives:
     def ways(self, segments: Segments, result: MetricResult) -> list[Way | None]:
         """The correction of each drive's wheels by the map, if they lose distance in turns.
 
-        All have one scale, that of the map: single drives do not show it better.
+        All change their length by one factor: single drives do not show it better.
         """
-        drives = zip(self.tracks(), self.image_poses(result), segments.ways, strict=True)
-        ways = [way_of(track, *images, way) for track, images, way in drives]
-        scales = [way.scale for way in ways if way]
-        return [way and way._replace(scale=float(np.mean(scales))) for way in ways]
+        ways, longer = list[Way | None](), list[float]()
+        for track, images, before in zip(
+            self.tracks(), self.image_poses(result), segments.ways, strict=True
+        ):
+            way = way_of(track, *images, before)
+            lengths = [
+                np.abs(track.ways() @ (each or Way()).values).sum() for each in (way, before)
+            ]
+            ways.append(way)
+            longer.append(float(lengths[0] / max(lengths[1], 1e-9)))
+        mean = np.mean([factor for factor, way in zip(longer, ways, strict=True) if way] or [1.0])
+        return [
+            way and way.scaled(float(mean) / factor)
+            for way, factor in zip(ways, longer, strict=True)
+        ]
 
 
 def rig_of(drives: Drives, segments: Segments) -> Rig:
     """What was learned of the robot."""
     usual, delays = Rig(), [d.delay_ns * 1e-9 for d in drives.items if d.delay_ns is not None]
-    ways = [way or Way(loss_std=usual.turn_loss.std) for way in segments.ways]
-    losses, loss_std = [way.loss for way in ways], max(way.loss_std for way in ways)
+    ways = [way or Way(1.0, usual.turn_loss, usual.speed_offset) for way in segments.ways]
+    turn_factor = _together(drives.turn_factors() or [Quantity(1.0, 0.0)])
     scale_std = segments.points.settled.scale_std if segments.points else SCALE_STD
     return Rig(
         **segments.mount.quantities,
         camera_delay=usual.camera_delay._replace(value=float(np.median(delays or [0.0]))),
         wheel_scale=Quantity(float(np.mean([way.scale for way in ways])), scale_std),
-        turn_loss=Quantity(float(np.mean(losses)), math.hypot(float(np.std(losses)), loss_std)),
+        turn_loss=_together([way.loss for way in ways]),
+        speed_offset=_together([way.offset for way in ways]),
+        turn_factor=turn_factor._replace(std=math.hypot(turn_factor.std, TURN_FACTOR_STD)),
     )
+
+
+def _together(drives: Sequence[Quantity]) -> Quantity:
+    """One quantity of several drives; the standard deviation includes how much it differs."""
+    values, stds = np.array(drives).T
+    return Quantity(float(values.mean()), math.hypot(float(values.std()), float(stds.max())))
 
 
 def compare_with_map(checks: Sequence[MotionCheck], drives: Drives, result: MetricResult) -> None:

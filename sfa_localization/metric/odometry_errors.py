@@ -1,43 +1,38 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of the odometry that images show: its turns, and the way that wheels lose in turns.
-
-Turns by slipping wheels err by tens of degrees a minute; the sums of shifts between images by one
-degree, but by more than wheels among trees near and far. A loop closure measures the turn since the
-robot was at the place before: its residuals give the noise of both, and the weights of their mean.
+"""The way that wheels count wrongly, as images show it.
 
 Wheels count more way in a turn than the robot drives: they slide, and controllers slow down. Four
-small robots lost 0.07 to 0.1 m per radian, half of the error of their odometry. In a map this
-averages out where tracks cross. Over some decimeters its images move by scale D - loss L, where D
-is the odometry's displacement in the frame of the map, and L its change by a loss of 1 m/rad.
+small robots lost 0.07 to 0.1 m per radian, half of the error of their odometry. Some count too
+little speed, also while they stand: by 0.02 m/s. In a map this averages out where tracks cross.
+Over some decimeters its images move by scale D - loss L + offset T, where D is the odometry's
+displacement in the frame of the map, L its change by a loss of 1 m/rad, and T that by 1 m/s.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
-from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_angle
+from sfa_localization.data.geometry import Array, Complex, Indices, Mask
+from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Run, Stamps
 from sfa_localization.data.statistics import MEDIAN_TO_STD, evenly, outlier_factor
 from sfa_localization.keyframes.closures import Closures, driven
 from sfa_localization.metric.dead_reckoning import OdometryTrack, Way, spaced, summed
 
 CLOSURES_MIN = 30
-"""Fewer closures show by chance that images turn better."""
-BETTER = 2.0
-"""Images are used if the noise of their turns is smaller by this factor: otherwise they gain
-little, and their errors are less white than those of good odometry."""
-# rad per square root of s: closures err by a fraction of a degree, and show no smaller noise.
-_LEAST_NOISE = 1e-4
+"""Fewer closures do not show the scale of two drives."""
 STEP_M = 0.3
 """Images this far apart are compared: nearer ones hide a loss in their own errors."""
 CHANCE_STDS = 4.0
 """A loss of fewer standard deviations may be chance."""
+OFFSET_STD = 0.01
+"""Prior of the offset of the speed, m/s: of five robots 0.003 to 0.023."""
 LARGEST_LOSS, LARGEST_SCALE = 0.3, 1.5
 """m per radian, half the track of a large robot, and scale of the way: beyond them images do not
 show a loss in turns."""
@@ -52,64 +47,6 @@ _PAIRED, _ROUNDS = 400, 10
 
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Headings:
-    """Unwrapped headings of one drive at its N images, rad: by the `track` of the odometry, and by
-    the sum of the shifts between `images`, whose sign may be either.
-    """
-
-    time_s: Array
-    track: Array
-    images: Array
-    part: Indices
-
-    @classmethod
-    def of(cls, track: OdometryTrack, stamps_ns: Stamps, images: Sequence[float]) -> Headings:
-        """At stamps (N,) by the clock of the odometry; `images` (N,) rad."""
-        time_s = (stamps_ns - track.stamps_ns[0]) * 1e-9
-        yaw = np.interp(time_s, track.seconds, track.yaw)
-        part = track.part[np.searchsorted(track.stamps_ns[1:], stamps_ns, 'right')]
-        return cls(time_s, yaw, np.unwrap(np.asarray(images, float)), part)
-
-
-def corrections(drives: Sequence[Headings], closures: Closures) -> tuple[list[Array], float] | None:
-    """What to add to the yaw (N,) rad of each drive at its images, and the noise of the turns then,
-    rad per square root of s; None if the closures do not show that images turn better.
-
-    The closures number the images of all drives one after the other.
-    """
-    residuals, time_s = _residuals(drives, closures)
-    if len(time_s) < CLOSURES_MIN:
-        return None
-    noise = MEDIAN_TO_STD * np.median(np.abs(residuals) / np.sqrt(time_s), axis=1)
-    odometry, same, opposite = np.maximum(noise, _LEAST_NOISE).tolist()
-    sign, images = min((1.0, same), (-1.0, opposite), key=lambda pair: pair[1])
-    if BETTER * images > odometry:
-        return None
-    total = odometry**2 + images**2
-    # Headings differ by whole turns, and between neighboring images by less than half of one.
-    differences = [np.unwrap(sign * drive.images - drive.track) for drive in drives]
-    share, noise = odometry**2 / total, odometry * images / np.sqrt(total)
-    return [share * (each - each[0]) for each in differences], float(noise)
-
-
-def _residuals(drives: Sequence[Headings], closures: Closures) -> tuple[Array, Array]:
-    """Residuals (3, L) rad of the turns by odometry, images, and images of the other sign, at the
-    closures inside an unbroken part of a drive, and their time (L,) s.
-    """
-    residuals, times, start = [np.zeros((3, 0))], [np.zeros(0)], 0
-    for drive in drives:
-        rows = closures.images - start
-        inside = np.flatnonzero(((rows >= 0) & (rows < len(drive.time_s))).all(1))
-        inside = inside[np.ptp(drive.part[rows[inside]], axis=1) == 0]
-        first, last = rows[inside].T
-        start += len(drive.time_s)
-        turned = [h[last] - h[first] for h in (drive.track, drive.images, -drive.images)]
-        residuals.append(np.asarray(wrap_angle(np.array(turned) - closures.turn[inside])))
-        times.append(np.maximum(np.abs(drive.time_s[last] - drive.time_s[first]), 1.0))
-    return np.concatenate(residuals, axis=1), np.concatenate(times)
 
 
 def way_of(
@@ -130,41 +67,43 @@ def way_of(
         return None
     turn = np.exp(1j * (poses[:, 2] - np.interp(time_s, seconds, track.yaw)))
     turn = np.exp(1j * np.angle(turn[first] + turn[last]))
-    by_odometry, by_loss, moved = (
-        way[last] - way[first]
-        for way in (
-            np.interp(time_s, seconds, summed(track.steps())),
-            np.interp(time_s, seconds, summed(track.way_per_loss())),
-            poses[:, 0] + 1j * poses[:, 1],
-        )
-    )
-    by_odometry, by_loss = turn * by_odometry, turn * by_loss
-    way = _fitted(moved, by_odometry, -by_loss)
+    driven = np.column_stack([np.interp(time_s, seconds, summed(way)) for way in track.ways().T])
+    ways = turn[:, None] * (driven[last] - driven[first])
+    places = poses[:, 0] + 1j * poses[:, 1]
+    moved = places[last] - places[first]
+    way = _fitted(moved, ways, OFFSET_STD)
+    if not _is_clear(way.offset):
+        way = _fitted(moved, ways, 0.0)
     if not 1 / LARGEST_SCALE < way.scale < LARGEST_SCALE:
         return None
     if before is not None:
-        shape = by_odometry - way.loss / way.scale * by_loss
-        whole_way = before.scale * by_odometry - before.loss * by_loss
-        scale = float(np.real(np.vdot(shape, whole_way)) / np.real(np.vdot(shape, shape)))
+        shape, whole = ways @ way.scaled(1 / way.scale).values, ways @ before.values
+        scale = float(np.real(np.vdot(shape, whole)) / np.real(np.vdot(shape, shape)))
         way = way.scaled(scale / way.scale)
-    clear = CHANCE_STDS * way.loss_std < abs(way.loss) < LARGEST_LOSS
-    return way if clear else None
+    clear = _is_clear(way.loss) or _is_clear(way.offset)
+    return way if clear and abs(way.loss.value) < LARGEST_LOSS else None
 
 
-def _fitted(moved: Complex, by_odometry: Complex, by_loss: Complex) -> Way:
-    """The way by least squares, with smaller weights of outliers among the places of images."""
-    columns = np.column_stack([by_odometry, by_loss])
-    rows = np.vstack([columns.real, columns.imag])
-    values = np.concatenate([moved.real, moved.imag])
-    weight = np.ones(len(values))
+def _is_clear(error: Quantity) -> bool:
+    return CHANCE_STDS * error.std < abs(error.value)
+
+
+def _fitted(moved: Complex, ways: Complex, offset_std: float) -> Way:
+    """The way by least squares of displacements (K,) by those of `OdometryTrack.ways` (K, 3), with
+    smaller weights of outliers among the places of images; `offset_std` m/s is a prior."""
+    rows, values = np.vstack([ways.real, ways.imag]), np.concatenate([moved.real, moved.imag])
+    prior = np.diag([0.0, 0.0, max(offset_std, 1e-6) ** -2])
+    weight, std = np.ones(len(values)), 1.0
     for _ in range(_ROUNDS):
-        root = np.sqrt(weight)
-        (scale, loss), *_ = np.linalg.lstsq(rows * root[:, None], values * root, rcond=None)
-        residual = values - rows @ [scale, loss]
+        weighted = (rows * weight[:, None]).T / std**2
+        covariance = np.linalg.pinv(weighted @ rows + prior)
+        way = covariance @ (weighted @ values)
+        residual = values - rows @ way
         std = max(MEDIAN_TO_STD * float(np.median(np.abs(residual))), 1e-9)
         weight = 1 / outlier_factor((residual / std) ** 2)
-    variance = np.linalg.pinv((rows * weight[:, None]).T @ rows) * std**2
-    return Way(float(scale), float(loss), float(np.sqrt(variance[1, 1])))
+    _, *stds = np.sqrt(np.diag(covariance)).tolist()
+    scale, *errors = way.tolist()
+    return Way(scale, *(Quantity(*both) for both in zip(errors, stds, strict=True)))
 
 
 def same_scale(runs: Sequence[Run], closures: Closures) -> tuple[Run, ...]:

@@ -21,7 +21,7 @@ from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_a
 from sfa_localization.data.run import Count, Odometry, Stamps, Trajectory, YawRate
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.keyframes.offsets import Offsets
-from sfa_localization.metric.dead_reckoning import OdometryTrack, Way, summed
+from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack, Way, summed
 from sfa_localization.metric.measured_points import MeasuredPoints
 from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.settings import SegmentConfig
@@ -214,7 +214,8 @@ class ImagePoses:
     """rad^2, the variance of yaw without a bias."""
     moment: Complex
     """Integral of t dp, s m, of the camera's place p: a bias of the yaw rate acts on it."""
-    slide: float
+    bridged: Array
+    """(K, 2) m^2 and rad^2, the variances of the way and the yaw in bridged pauses."""
 
     @classmethod
     def on(cls, track: OdometryTrack, stamps: Stamps, skipped: Counter[str]) -> ImagePoses:
@@ -240,12 +241,11 @@ class ImagePoses:
             turned=np.interp(time_s, seconds, track.turned),
             noise=np.interp(time_s, seconds, track.yaw_variance),
             moment=np.interp(time_s, seconds, moment),
-            slide=track.slide,
+            bridged=np.column_stack([np.interp(time_s, seconds, sums) for sums in track.bridged.T]),
         )
 
     def take(self, keep: Mask) -> ImagePoses:
-        rows = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name != 'slide'}
-        return replace(self, **rows)
+        return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def turn_variance(self, first: int, last: int) -> float:
         """Of the turn between two images, rad^2."""
@@ -255,9 +255,10 @@ class ImagePoses:
     def place_variance(self, first: int, last: int) -> float:
         """Of the displacement between two images, m^2 per axis: distance, yaw, sliding wheels."""
         length = float(self.length[last] - self.length[first])
-        slide = self.slide * float(self.turned[last] - self.turned[first])
+        slide = TURN_SLIDE * float(self.turned[last] - self.turned[first])
         yaw = self.turn_variance(first, last)
-        return DISTANCE_NOISE**2 * length + yaw * length**2 / 3 + slide**2
+        bridged = float(self.bridged[last, 0] - self.bridged[first, 0])
+        return DISTANCE_NOISE**2 * length + yaw * length**2 / 3 + slide**2 + bridged
 
     def drift(self, first: int, rows: Indices, heading: float, time_s: float) -> Complex:
         """What a yaw-rate bias of 1 rad/s adds to the path from image `first`, in a frame whose
@@ -327,7 +328,7 @@ def _wear(poses: ImagePoses, group: Indices) -> Array:
     # The heading's variance v moves the end of a length l by v l^2 / 3, which grows with l^3.
     # Variances add up: the error of k equal steps is sqrt(k) times that of one.
     random = DISTANCE_NOISE**2 * length / limit + np.cbrt(length**2 * noise / (3 * limit))
-    slip = (poses.slide + YAW_SLIP * PIECE_LENGTH_M / 2) * turned
+    slip = (TURN_SLIDE + YAW_SLIP * PIECE_LENGTH_M / 2) * turned
     return summed(np.maximum(length / PIECE_LENGTH_M, random) + slip / PIECE_STD_M)
 
 

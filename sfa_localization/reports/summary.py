@@ -52,10 +52,9 @@ def summary(trained: Trained) -> str:
     for run, check in zip(trained.runs, trained.checks, strict=False):
         lines += [f'{run.name}: {text}' for text in check.wrong + check.corrected]
     for run, way in zip(trained.runs, trained.segments.ways, strict=True):
-        if way and way.loss:
-            lines.append(
-                f'{run.name}: wheels lose {way.loss:.2f} m per radian in turns: taken into account'
-            )
+        if way and way.loss.value:
+            loss = f'{way.loss.value:.2f} m per radian in turns'
+            lines.append(f'{run.name}: wheels lose {loss}: taken into account')
     used = {f'{run.name}: {name}': n for run in trained.runs for name, n in run.counts.items()}
     used['metric learning: images'] = trained.segments.images
     used['metric learning: odometry'] = trained.segments.odometry

@@ -1,0 +1,187 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The turns of a drive by odometry and by images, weighed by their noise, which the drive shows.
+
+From image to image, odometry counts the turn w over dt seconds, and images show i over m meters.
+Both measure the turn T:
+
+    T = (1 + k) w - b dt + noise of variance A dt + B |w|
+    T = i + noise of variance Q + P m min(m, 4 m)
+
+with the factor k and the bias b of each drive. Things beside the way turn images by an angle that
+depends on the place (0.01 to 0.05 rad per m of way, over about 4 m): a sum of shifts bends the map,
+which closures cannot see, because they return to the place. The variances are fit to the squares of
+what images turn more than the odometry, from image to image and over some meters; where bad wheels
+hide P, its prior decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from sfa_localization.data.geometry import Array, Indices, Mask, wrap_angle
+from sfa_localization.data.rig import Quantity
+from sfa_localization.data.run import Stamps
+from sfa_localization.data.statistics import outlier_factor
+from sfa_localization.metric.dead_reckoning import OdometryTrack, summed
+
+REACH_M = 4.0
+"""Way over which things beside it turn images by a constant angle per meter, at most."""
+NOISE: Array = np.array([0.003, 0.01, 0.003, 0.013]) ** 2
+"""A, B, Q and P before any is learned. In three gardens Q is the square of 0.0013 to 0.005 rad, P
+of 0.01 to 0.025 rad per m; of wheels, A is the square of 0.001 to 0.02 and B of 0.001 to 0.15."""
+NOISE_FIRST: Array = np.array([0.03, 0.3, 0.01, 0.05]) ** 2
+"""From which they are fit: larger than that of any robot, so that no error is far at first."""
+NOISE_SPREAD: Array = np.array([3.0, 3.0, 1.0, 1.0])
+"""Standard deviations of the logarithms of these."""
+FACTOR_STD, BIAS_STD = 0.3, 0.003
+"""Priors: of the factor of wheels on any ground, and of a bias, rad/s."""
+FAR = 8.0
+"""Standard deviations beyond which an error counts no more: images that match by chance."""
+ALIKE = 0.7
+"""Images whose turns correlate less with those of the odometry measure another motion."""
+FAR = 8.0
+"""Standard deviations beyond which an error counts no more: images that match by chance."""
+# Rounds of weights and variances, from where they hardly change.
+_ROUNDS = 8
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class Headings:
+    """One drive at its N images: unwrapped headings, rad, by the `track` of the odometry, and by
+    the sum of the shifts between `images`, whose sign may be either; the way driven, m."""
+
+    time_s: Array
+    track: Array
+    images: Array
+    part: Indices
+    way_m: Array
+    bridged: Array
+    """rad^2: variance of the odometry's yaw in bridged pauses."""
+
+    @classmethod
+    def of(cls, track: OdometryTrack, stamps_ns: Stamps, images: Sequence[float]) -> Headings:
+        """At stamps (N,) by the clock of the odometry; `images` (N,) rad."""
+        time_s = (stamps_ns - track.stamps_ns[0]) * 1e-9
+        yaw = np.interp(time_s, track.seconds, track.yaw)
+        part = track.part[np.searchsorted(track.stamps_ns[1:], stamps_ns, 'right')]
+        way_m = np.interp(time_s, track.seconds, track.length)
+        bridged = np.interp(time_s, track.seconds, track.bridged[:, 1])
+        return cls(time_s, yaw, np.unwrap(np.asarray(images, float)), part, way_m, bridged)
+
+
+@dataclass(frozen=True, slots=True)
+class Turns:
+    """Of a drive at its N images: what to `add` to the yaw of its odometry, rad, and the `variance`
+    of the sum of turns then, rad^2 since the start; true over counted turns is `factor`."""
+
+    add: Array
+    variance: Array
+    factor: Quantity
+
+
+def estimated(drives: Sequence[Headings]) -> list[Turns] | None:
+    """The turns of each drive; None where images turn otherwise than the odometry."""
+    steps, prior = _Steps.of(drives), np.repeat([FACTOR_STD, BIAS_STD], len(drives)) ** -2
+    if steps.correlation < ALIKE:
+        return None
+    noise, turns, outlier = NOISE_FIRST, steps.odometry + steps.more, np.ones(len(steps.more))
+    for _ in range(_ROUNDS):
+        by_odometry = steps.sources[:, :2] @ noise[:2] + steps.bridged
+        total = by_odometry + steps.sources[:, 2:] @ noise[2:]
+        # Noise of the turns counted would make their factor too small: they are multiplied by the
+        # turns estimated instead (instrumental variables).
+        weighted = steps.errors(turns).T * (steps.unbroken / (total * outlier))
+        covariance = np.linalg.inv(weighted @ steps.errors(steps.odometry) + np.diag(prior))
+        values = covariance @ (weighted @ steps.more)
+        corrected = steps.errors(steps.odometry) @ values
+        residual = steps.more - corrected
+        add = corrected + steps.unbroken * by_odometry / total * residual
+        turns, outlier = steps.odometry + add, outlier_factor(residual**2 / total)
+        noise = steps.noise(residual, noise)
+    variance = by_odometry * np.where(steps.unbroken, 1 - by_odometry / total, 1.0)
+    stds, ends = np.sqrt(np.diag(covariance)), np.cumsum([len(drive.track) - 1 for drive in drives])
+    parts = zip(np.split(add, ends[:-1]), np.split(variance, ends[:-1]), values, stds, strict=False)
+    return [
+        Turns(summed(added), summed(variances), Quantity(1 + float(value), float(std)))
+        for added, variances, value, std in parts
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """The M steps from image to image of all D drives, rad: turns of the odometry, and how much
+    `more` images turn. `sources` (M, 4) multiply the noise A to P, rad^2 in `bridged` pauses add
+    to it; `windows` are the first steps of some meters. Where the odometry breaks, steps are not
+    `unbroken`."""
+
+    odometry: Array
+    more: Array
+    own: Mask
+    """(M, D) whether a step is of the drive."""
+    time_s: Array
+    sources: Array
+    bridged: Array
+    unbroken: Mask
+    windows: Indices
+
+    @classmethod
+    def of(cls, drives: Sequence[Headings]) -> _Steps:
+        def steps(name: str) -> NDArray[Any]:
+            columns: list[NDArray[Any]] = [np.diff(getattr(drive, name)) for drive in drives]
+            return np.concatenate(columns)
+
+        odometry, images, unbroken = steps('track'), steps('images'), steps('part') == 0
+        time_s, way_m = steps('time_s'), steps('way_m')
+        images = wrap_angle(images if images @ odometry >= 0 else -images)
+        drive = np.repeat(np.arange(len(drives)), [len(each.track) - 1 for each in drives])
+        own = np.equal.outer(drive, np.arange(len(drives)))
+        sources = np.column_stack([time_s, np.abs(odometry), np.ones(len(drive)), way_m * REACH_M])
+        number = np.column_stack([drive, summed(way_m)[:-1] // REACH_M, unbroken])
+        new = np.any(np.diff(number, axis=0) != 0, axis=1)
+        windows = np.append(0, np.flatnonzero(new) + 1)
+        more = np.asarray(wrap_angle(images - odometry))
+        return cls(odometry, more, own, time_s, sources, steps('bridged'), unbroken, windows)
+
+    def errors(self, turns: Array) -> Array:
+        """(M, 2 D): derivatives of turns (M,) rad by the factors and biases of the drives."""
+        return np.hstack([self.own * turns[:, None], self.own * -self.time_s[:, None]])
+
+    @property
+    def correlation(self) -> float:
+        """Of the turns of images and odometry."""
+        x, y = self.odometry[self.unbroken], (self.odometry + self.more)[self.unbroken]
+        fastest = float(np.max(np.abs(x), initial=0.0))
+        y = np.clip(y, -fastest, fastest)  # images that match by chance
+        power = float(x @ x) * float(y @ y)
+        return float(x @ y / np.sqrt(max(power, _TINY)))
+
+    def noise(self, residual: Array, before: Array) -> Array:
+        """The likeliest A to P by the `residual` (M,) rad between images and odometry, in steps and
+        windows, near those of `before`."""
+        single = self.unbroken & (self.bridged == 0)
+        whole = np.logical_and.reduceat(single, self.windows)
+        rows = np.vstack([self.sources[single], np.add.reduceat(self.sources, self.windows)[whole]])
+        rows[:, 3] *= np.minimum(rows[:, 3] / REACH_M**2, 1.0)
+        in_windows = np.add.reduceat(residual, self.windows)[whole]
+        squares = np.append(residual[single], in_windows) ** 2
+
+        def cost(logarithms: Array) -> tuple[float, Array]:
+            noise = np.exp(logarithms)
+            variance = rows @ noise
+            ratio, beside = squares / variance, (logarithms - np.log(NOISE)) / NOISE_SPREAD
+            near = np.minimum(ratio, FAR**2)
+            slope = (1 - near) / variance @ rows * noise / 2 + beside / NOISE_SPREAD
+            misfit = near * (1 + np.log(np.maximum(ratio / near, 1.0)))
+            total = (np.log(variance) + misfit).sum() + beside @ beside
+            return float(total) / 2, np.asarray(slope)
+
+        best = minimize(cost, np.log(before), jac=True, method='L-BFGS-B')
+        return np.asarray(np.exp(best.x))
