@@ -33,6 +33,8 @@ RETURN_S = 0.5
 """Messages of a path pause for less: a driver that fails for longer breaks the path."""
 _STALE_S = 0.2
 """Poses that are repeated, and messages that come in bundles, may be renewed as seldom as this."""
+FIRST_SPEED = 2.0
+"""m/s at most of a robot that starts, where no twist says its speed."""
 IN_TURN, _MEMORY = 0.1, 50
 """Share, among so many messages, of changes between two paths that move: 1 of two publishers that
 alternate, 0.2 where one is nine times as fast, 0 of single faults, whose pose stands."""
@@ -72,13 +74,15 @@ def learned(noise: float, distance: float) -> float:
 
 
 class _Message(NamedTuple):
-    """A message: its number, and that of the first on its path; v m/s and omega rad/s."""
+    """A message: its number, and that of the first on its path; v m/s and omega rad/s. Its pose
+    was `renewed_s` first; None before its path has moved."""
 
     path: int
     number: int
     seconds: float
     pose: Sequence[float]
     twist: tuple[float, float]
+    renewed_s: float
 
 
 class Paths:
@@ -89,6 +93,7 @@ class Paths:
 
     def __init__(self, noise: float = NOISE_START) -> None:
         self._ends: list[_Message] = []  # of the paths; that of the last message comes last
+        self._fills_twist = False
         self._messages, self._returned = 0, -1
         self.noise, self._share = noise, 0.0
         self.aside = 0
@@ -102,13 +107,18 @@ class Paths:
     def add(self, seconds: float, pose: Sequence[float], v: float, omega: float) -> int:
         """Take a message with a pose x m, y m, yaw rad; returns the number of its path."""
         ends = [end for end in self._ends if seconds - end.seconds < RETURN_S]
-        message = _Message(self._messages, self._messages, seconds, pose, (v, omega))
+        self._fills_twist |= bool(v or omega)
+        message = _Message(self._messages, self._messages, seconds, pose, (v, omega), seconds)
         self._messages, self.aside = self._messages + 1, 0
         for end in reversed(ends):
-            distance = _distance(end, message)
+            distance = _distance(end, message, self._fills_twist)
             if distance <= tolerance(seconds - end.seconds, self.noise):
                 self.noise = learned(self.noise, distance)
                 message = message._replace(path=end.path)
+                if not self._fills_twist and end.pose == message.pose:
+                    message = message._replace(renewed_s=end.renewed_s, twist=end.twist)
+                elif not self._fills_twist:
+                    message = message._replace(twist=_between(end, message))
                 if end.pose != message.pose:
                     self._continued(end, message.number - end.number - 1)
                 break
@@ -124,11 +134,25 @@ class Paths:
             self.aside = 0 if self.in_turn else others
 
 
-def _distance(end: _Message, message: _Message) -> float:
-    """How far a message, m or rad, is `beyond` the speeds from the end of a path."""
+def _between(end: _Message, message: _Message) -> tuple[float, float]:
+    """Speed m/s and turn rate rad/s from the end of a path to a message, by their poses."""
+    seconds = max(message.seconds - end.renewed_s, 1e-3)
+    dx, dy, turn = (b - a for a, b in zip(end.pose, message.pose, strict=True))
+    ahead = dx * math.cos(end.pose[2]) + dy * math.sin(end.pose[2])
+    return ahead / seconds, math.remainder(turn, math.tau) / seconds
+
+
+def _distance(end: _Message, message: _Message, fills_twist: bool) -> float:
+    """How far a message, m or rad, is `beyond` the speeds from the end of a path: those of twists,
+    or without any that between its last poses."""
+    longest_s, twists = message.seconds - end.renewed_s + _STALE_S, (end.twist, message.twist)
+    if fills_twist:
+        longest_s = message.seconds - end.seconds + _STALE_S
+    elif end.twist == (0.0, 0.0):
+        dx, dy = (b - a for a, b in zip(end.pose[:2], message.pose[:2], strict=True))
+        return max(math.hypot(dx, dy) - FIRST_SPEED * longest_s, 0.0)
     dx, dy, turn = (b - a for a, b in zip(end.pose, message.pose, strict=True))
     c, s, turn = math.cos(end.pose[2]), math.sin(end.pose[2]), math.remainder(turn, math.tau)
-    longest_s, twists = message.seconds - end.seconds + _STALE_S, (end.twist, message.twist)
 
     def missed(step: float, speed: float) -> float:
         return step - sorted((0.0, step, speed * longest_s))[1]

@@ -33,6 +33,8 @@ from sfa_localization.metric.dead_reckoning import OdometryTrack, summed
 
 REACH_M = 4.0
 """Way over which things beside it turn images by a constant angle per meter, at most."""
+FOLLOWED_M = 1.0
+"""Robots follow commands late: over less way, turns and what is counted of them hardly agree."""
 NOISE: Array = np.array([0.003, 0.01, 0.003, 0.013]) ** 2
 """A, B, Q and P before any is learned. In three gardens Q is the square of 0.0013 to 0.005 rad, P
 of 0.01 to 0.025 rad per m; of wheels, A is the square of 0.001 to 0.02 and B of 0.001 to 0.15."""
@@ -92,19 +94,22 @@ def estimated(drives: Sequence[Headings]) -> list[Turns] | None:
     steps, prior = _Steps.of(drives), np.repeat([FACTOR_STD, BIAS_STD], len(drives)) ** -2
     if steps.correlation < ALIKE:
         return None
-    noise, turns, outlier = NOISE_FIRST, steps.odometry + steps.more, np.ones(len(steps.more))
+    noise, turns, outlier = NOISE_FIRST, steps.odometry + steps.more, 1.0
+    more, counted = steps.summed(steps.more), steps.summed(steps.errors(steps.odometry))
     for _ in range(_ROUNDS):
         by_odometry = steps.sources[:, :2] @ noise[:2] + steps.bridged
         total = by_odometry + steps.sources[:, 2:] @ noise[2:]
         # Noise of the turns counted would make their factor too small: they are multiplied by the
         # turns estimated instead (instrumental variables).
-        weighted = steps.errors(turns).T * (steps.unbroken / (total * outlier))
-        covariance = np.linalg.inv(weighted @ steps.errors(steps.odometry) + np.diag(prior))
-        values = covariance @ (weighted @ steps.more)
+        weight = steps.whole / (steps.summed(total) * outlier)
+        weighted = steps.summed(steps.errors(turns)).T * weight
+        covariance = np.linalg.inv(weighted @ counted + np.diag(prior))
+        values = covariance @ (weighted @ more)
+        outlier = outlier_factor((more - counted @ values) ** 2 / steps.summed(total))
         corrected = steps.errors(steps.odometry) @ values
         residual = steps.more - corrected
         add = corrected + steps.unbroken * by_odometry / total * residual
-        turns, outlier = steps.odometry + add, outlier_factor(residual**2 / total)
+        turns = steps.odometry + add
         noise = steps.noise(residual, noise)
     variance = by_odometry * np.where(steps.unbroken, 1 - by_odometry / total, 1.0)
     stds, ends = np.sqrt(np.diag(covariance)), np.cumsum([len(drive.track) - 1 for drive in drives])
@@ -119,8 +124,8 @@ def estimated(drives: Sequence[Headings]) -> list[Turns] | None:
 class _Steps:
     """The M steps from image to image of all D drives, rad: turns of the odometry, and how much
     `more` images turn. `sources` (M, 4) multiply the noise A to P, rad^2 in `bridged` pauses add
-    to it; `windows` are the first steps of some meters. Where the odometry breaks, steps are not
-    `unbroken`."""
+    to it; `short` and `windows` are the first steps of 1 m and of 4 m. Where the odometry breaks,
+    steps are not `unbroken`."""
 
     odometry: Array
     more: Array
@@ -130,6 +135,7 @@ class _Steps:
     sources: Array
     bridged: Array
     unbroken: Mask
+    short: Indices
     windows: Indices
 
     @classmethod
@@ -144,15 +150,25 @@ class _Steps:
         drive = np.repeat(np.arange(len(drives)), [len(each.track) - 1 for each in drives])
         own = np.equal.outer(drive, np.arange(len(drives)))
         sources = np.column_stack([time_s, np.abs(odometry), np.ones(len(drive)), way_m * REACH_M])
-        number = np.column_stack([drive, summed(way_m)[:-1] // REACH_M, unbroken])
-        new = np.any(np.diff(number, axis=0) != 0, axis=1)
-        windows = np.append(0, np.flatnonzero(new) + 1)
+        short, windows = (
+            np.append(0, np.flatnonzero(np.diff(summed(way_m)[:-1] // length + drive / 2)) + 1)
+            for length in (FOLLOWED_M, REACH_M)
+        )
         more = np.asarray(wrap_angle(images - odometry))
-        return cls(odometry, more, own, time_s, sources, steps('bridged'), unbroken, windows)
+        return cls(odometry, more, own, time_s, sources, steps('bridged'), unbroken, short, windows)
 
     def errors(self, turns: Array) -> Array:
         """(M, 2 D): derivatives of turns (M,) rad by the factors and biases of the drives."""
         return np.hstack([self.own * turns[:, None], self.own * -self.time_s[:, None]])
+
+    def summed(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Sums (W, ...) of steps (M, ...) over short windows."""
+        return np.asarray(np.add.reduceat(values, self.short, axis=0))
+
+    @property
+    def whole(self) -> Mask:
+        """(W,) whether the odometry does not break in short windows."""
+        return np.asarray(np.logical_and.reduceat(self.unbroken, self.short))
 
     @property
     def correlation(self) -> float:
