@@ -164,7 +164,7 @@ def _judged(
     for name, track in tracks.items():
         scores[name] |= calibration(truth.poses, estimates[name], turn, track.covariances)
         scores[name]['similarity'] = similarity(truth.poses, estimates[name])
-    localised = np.array([level is Level.LOCALISED for _, level, state in outputs if state])
+    localised = np.array([level is Level.LOCALISED for _, level, state in outputs if state], bool)
     wrong_s = _false_localised_s(truth.poses, estimates['ekf'], localised)
     counts = {**_counts(drive, outputs, fused), 'false_localised_s': wrong_s}
     features = np.array([image.slow_features for image in observations if not image.problem])

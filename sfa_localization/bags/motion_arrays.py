@@ -11,7 +11,7 @@ import numpy as np
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Mask, relative
-from sfa_localization.data.odometry_steps import IN_TURN, beside
+from sfa_localization.data.odometry_steps import IN_TURN, Orientation, beside
 from sfa_localization.data.run import (
     POINT_STD_M,
     Odometry,
@@ -97,6 +97,14 @@ def _empty(rows: Array) -> Mask:
     return np.asarray(~posed & ~moves & (alone | ~moves.any()))
 
 
+def _oriented(odometry: Odometry) -> bool:
+    orientation, seconds = Orientation(), (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
+    yaws, rates = odometry.poses[:, 2].tolist(), odometry.twists[:, 1].tolist()
+    for message in zip(seconds.tolist(), yaws, rates, strict=True):
+        orientation.add(*message)
+    return orientation.is_filled
+
+
 def _filled(odometry: Odometry) -> tuple[Odometry, str]:
     """Odometry with twists integrated where there are no poses, and a sentence on that or ''."""
     stamps, poses, twists = odometry.stamps_ns, odometry.poses, odometry.twists
@@ -106,6 +114,8 @@ def _filled(odometry: Odometry) -> tuple[Odometry, str]:
         text = f'{count} have no pose (NaN, or a quaternion of zeros)'
     elif len(stamps) > 1 and drives and not np.ptp(poses, axis=0).any():
         lacks, text = ~lacks, 'the pose is constant'
+    elif len(stamps) > 1 and drives and not _oriented(odometry):
+        lacks, text = ~lacks, 'the orientation is never filled'
     else:
         return odometry, ''
     by_twist = integrate(stamps, twists)

@@ -24,7 +24,7 @@ from sfa_localization.bags.settings import BagConfig
 from sfa_localization.bags.topic_stream import Stream, Used
 from sfa_localization.camera.video import ImageReader
 from sfa_localization.data.errors import BagError, DataError, LocalizationError, MessageError
-from sfa_localization.data.messages import NO_STAMP, read_stamp
+from sfa_localization.data.messages import IMPOSSIBLE_STAMP, NO_STAMP, read_stamp
 from sfa_localization.data.rejections import listed
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory
 
@@ -52,6 +52,14 @@ KINDS = {
     'points_topic': Kind('measured places', '--points-topic', decoding.PLACES, decoding.PLACES),
     'ground_truth': Kind('true poses', '--ground-truth-topic', _TRUTH, decoding.TRUTHS),
 }
+
+STAMP_FAULTS = {
+    'duplicate stamp': 'the stamp of the one before, as of drivers that stamp whole seconds',
+    IMPOSSIBLE_STAMP: 'stamps of 1e9 nanoseconds or more',
+}
+"""Why stamps of a topic are unusable, by the reason for which its messages are skipped."""
+FAULTY_STAMPS = 2.0
+"""Where so many times as many messages are skipped as used, the others have wrong stamps too."""
 
 
 class Bag:
@@ -243,6 +251,13 @@ class Bag:
             add_problem(self.problems, f'{stream.topic}: {lost}')
             stream.skipped.add('lost in a damaged bag', expected - stream.received)
         self._raise_problems()
+        for fault, cause in STAMP_FAULTS.items():
+            count = stream.skipped[fault]
+            if stream.required and count > FAULTY_STAMPS * stream.used > 0:
+                raise BagError(
+                    f'{self.path}: {stream.topic}: {count} messages have {cause}: use the time of '
+                    'reception (stamp_source: receive)'
+                )
         if stream.required and stream.used == 0:
             reasons = ', '.join(f'{n} {why}' for why, n in stream.skipped.items())
             reasons = reasons or 'none recorded'

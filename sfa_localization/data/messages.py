@@ -16,6 +16,7 @@ from sfa_localization.data.errors import MessageError
 
 NANOSECONDS = 1_000_000_000
 NO_STAMP = 'zero or negative stamp'
+IMPOSSIBLE_STAMP = 'impossible stamp'
 _LARGEST = 1e9
 """No robot reaches this number of m, rad, m/s or rad/s: the field was never set."""
 LARGEST_VARIANCE = 1e6
@@ -33,7 +34,7 @@ _STEEPEST = math.radians(45.0)
 def read_stamp(stamp: Any) -> int:
     """Nanoseconds of a builtin_interfaces/Time."""
     if not 0 <= stamp.nanosec < NANOSECONDS:
-        raise MessageError('impossible stamp')
+        raise MessageError(IMPOSSIBLE_STAMP)
     total = int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
     if total <= 0:
         raise MessageError(NO_STAMP)

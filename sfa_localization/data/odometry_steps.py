@@ -33,6 +33,8 @@ RETURN_S = 0.5
 """Messages of a path pause for less: a driver that fails for longer breaks the path."""
 _STALE_S = 0.2
 """Poses that are repeated, and messages that come in bundles, may be renewed as seldom as this."""
+UNTURNED_RAD = 0.2
+"""An orientation that is constant while the twist turns by this is not filled."""
 FIRST_SPEED = 2.0
 """m/s at most of a robot that starts, where no twist says its speed."""
 IN_TURN, _MEMORY = 0.1, 50
@@ -159,6 +161,25 @@ def _distance(end: _Message, message: _Message, fills_twist: bool) -> float:
 
     moved = min(math.hypot(missed(dx * c + dy * s, v), dy * c - dx * s) for v, _ in twists)
     return max(moved, min(abs(missed(turn, omega)) for _, omega in twists))
+
+
+class Orientation:
+    """Whether the orientation of messages is filled: drivers leave it constant while the twist
+    turns."""
+
+    def __init__(self) -> None:
+        self._seconds, self._yaw, self._changes, self._turned = 0.0, math.nan, 0, 0.0
+
+    @property
+    def is_filled(self) -> bool:
+        """Until the twist shows otherwise."""
+        return self._changes > 1 or self._turned < UNTURNED_RAD
+
+    def add(self, seconds: float, yaw: float, omega: float) -> None:
+        """Take the next message."""
+        self._changes += yaw != self._yaw  # also the first one
+        self._turned += abs(omega) * sorted((0.0, seconds - self._seconds, RETURN_S))[1]
+        self._seconds, self._yaw = seconds, yaw
 
 
 def beside(seconds: Array, poses: Array, twists: Array) -> tuple[Mask, float]:

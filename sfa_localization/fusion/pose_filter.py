@@ -21,7 +21,7 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS, clock_difference
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.odometry_steps import Paths
+from sfa_localization.data.odometry_steps import Orientation, Paths
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.belief import (
     Belief,
@@ -104,7 +104,7 @@ class PoseFilter:
         self._camera = CameraClockFinder(_CLOCK_MEMORY, self._camera.clock)
         self._history = self._fresh(self._ekf.blank(0))
         self._timeline, self._open_loop = Timeline(), OpenLoop()
-        self._paths, self._was_empty = Paths(), False
+        self._paths, self._orientation, self._was_empty = Paths(), Orientation(), False
         self._judged: tuple[object, Health] | None = None
         self._waiting: tuple[Array, Array] | None = None
         if self.config.initial_pose:
@@ -180,8 +180,9 @@ class PoseFilter:
     def _path_pose(
         self, stamp_ns: int, v: float, omega: float, pose: Sequence[float] | Array | None
     ) -> Pose | None:
-        """The pose of a message in the scale of the map; None for one without, and while poses lead
-        along two paths in turn. Raises DataError for a single message without pose and twist.
+        """The pose of a message in the scale of the map; None for one without, or without an
+        orientation, and while poses lead along two paths in turn. Raises DataError for a single
+        message without pose and twist.
         """
         posed = pose is not None and all(map(math.isfinite, pose))
         empty = not (posed or v or omega) and self._history.newest.odometry.pose is not None
@@ -191,6 +192,9 @@ class PoseFilter:
         if pose is None or not posed:
             return None
         x, y, yaw = map(float, pose)
+        self._orientation.add(stamp_ns * 1e-9, yaw, omega)
+        if not self._orientation.is_filled:
+            return None
         self._paths.add(stamp_ns * 1e-9, (x, y, yaw), v, omega)
         if self._paths.aside:
             self.counts['odometry: pose beside the path'] += self._paths.aside

@@ -216,9 +216,13 @@ def _together(drives: Sequence[Quantity]) -> Quantity:
 
 
 def compare_with_map(checks: Sequence[MotionCheck], drives: Drives, result: MetricResult) -> None:
-    """Add the comparison of the map with the odometry to each drive's."""
-    for check, drive, images in zip(checks, drives.items, drives.image_poses(result), strict=True):
-        pair = compare_map(drive.run.odometry, *images)
+    """Add the comparison of the map with the odometry, whose turns are corrected, to each drive's."""
+    for check, drive, track, images in zip(
+        checks, drives.items, drives.tracks(), drives.image_poses(result), strict=True
+    ):
+        odometry = drive.run.odometry
+        turned = track.poses if len(track.poses) == len(odometry.poses) else odometry.poses
+        pair = compare_map(replace(odometry, poses=turned), *images)
         check.pairs += [pair] if pair else []
 
 

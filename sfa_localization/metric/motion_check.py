@@ -24,6 +24,7 @@ from sfa_localization.metric.breaks import StampedTextures, contradicted, parted
 from sfa_localization.metric.motion_clocks import Drift, drift_sentences, drifts, following
 from sfa_localization.metric.motion_gyro import cleaned
 from sfa_localization.metric.motion_sources import (
+    CERTAIN,
     ENOUGH,
     EQUAL,
     GYRO,
@@ -41,6 +42,9 @@ from sfa_localization.metric.motion_sources import (
 
 SKIDDING = 5.0
 """Skidding wheels are off by a factor of two: more is another unit, axis or source."""
+WHOLE_BY_GYRO = 1.03
+"""Panoramas that show a whole turn turn 1.000 to 1.008 times as far as gyroscopes; 15 degrees less
+are 1.04."""
 FASTEST_MPS = 30.0
 """A faster robot publishes other units than meters."""
 SIDEWAYS, SLIGHT_TURN = 0.25, 1.0
@@ -149,6 +153,7 @@ def check_motion(
         _judge_axes(check)
         _judge_following(check, sources, commands)
         _judge(check, 'turns')
+        _judge_width(check)
         _judge_clocks(check)
         if views is not None:
             clock = check.image_drift or Drift(0, turns.late_s if turns else 0.0, 0.0)
@@ -162,6 +167,19 @@ def check_motion(
         check.notes += of_images
         check.wrong = [text for text in check.wrong if text not in of_images]
     return check
+
+
+def _judge_width(check: MotionCheck) -> None:
+    """Whether panoramas show a whole turn, by a gyroscope that turns alike."""
+    pair = check.pair(GYRO, IMAGES)
+    if pair is None or pair.correlation < CERTAIN or pair.differs('scale'):
+        return
+    factor = abs(pair.scale)
+    if not 1 / WHOLE_BY_GYRO < factor < WHOLE_BY_GYRO:
+        check.notes.append(
+            f'{IMAGES} turn {factor:.2f} times as far as the {GYRO}, as panoramas of '
+            f'{360 / factor:.0f} degrees would: let their width show all around once'
+        )
 
 
 def _impossible(sources: Sequence[Source]) -> Iterator[str]:
