@@ -253,6 +253,11 @@ def test_stamps_that_cannot_be(tmp_path):
         with Bag(record(tmp_path / str(number), entries)) as bag:
             assert bag.trajectory().stamps_ns.tolist() == used
             assert bag.counts['/p'].skipped == skipped
+    whole = [stamp(0) // 10**9 * 10**9 + i // 10 * 10**9 for i in range(40)]
+    entries = [('/p', s + i, pose_stamped(s, 0.0, 0.0, 0.0)) for i, s in enumerate(whole)]
+    refusal = pytest.raises(BagError, match=r'36 messages have the stamp .*stamp_source: receive')
+    with Bag(record(tmp_path / 'whole', entries)) as bag, refusal:
+        bag.trajectory()
     entries = [('/p', stamp(i), pose_stamped(0, *pose(i))) for i in range(COUNT)]
     path = record(tmp_path / 'bag', entries)
     refusal = pytest.raises(BagError, match=r'6 zero or negative stamp.*stamp_source: receive')

@@ -16,6 +16,7 @@ from metric_worlds import criss_cross, drive, lanes, meander
 
 from sfa_localization.bags.drives import read_drive
 from sfa_localization.bags.writer import BagWriter
+from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import CameraError, DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.run import (
@@ -175,6 +176,18 @@ def test_a_gyroscope_is_corrected(sample, factor, late_s, texts):
     at = (run.yaw_rate.stamps_ns - start) * 1e-9 + 0.02
     expected = np.interp(at, (right.stamps_ns - start) * 1e-9, right.omega)
     assert np.abs(run.yaw_rate.omega - expected)[60:-60].max() < 0.05
+
+
+@pytest.mark.parametrize(('factor', 'shown'), [(1.0, None), (1.09, 330), (0.9, 400)])
+def test_panoramas_of_less_than_a_turn_are_named_where_a_gyroscope_shows_it(sample, factor, shown):
+    turns = np.unwrap(list(headings(sample.panoramas))) * factor
+    images = sample.panoramas.stamps_ns, turns
+    check = check_motion(sample.odometry, images, sample.yaw_rate)
+    told = [text for text in check.notes if 'degrees would' in text]
+    assert len(told) == (shown is not None)
+    for text in told:
+        degrees = float(text.split('panoramas of ')[1].split()[0])
+        assert degrees == pytest.approx(shown, abs=15)
 
 
 def held(rate: np.ndarray, rng) -> np.ndarray:

@@ -13,7 +13,7 @@ from filter_drives import SECOND, START_NS, FilterDrive, from_rest, started, win
 from sfa_localization.bags.motion_arrays import to_odometry
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import compose, invert
-from sfa_localization.data.odometry_steps import beyond
+from sfa_localization.data.odometry_steps import Paths, beyond
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
@@ -91,6 +91,32 @@ def test_a_pose_that_is_repeated_adds_nothing(times, twist):
     last = renewed[-1]  # beyond it, nobody knows
     assert outputs[last][1] < 0.02
     assert np.mean([error for _, error, *_ in outputs]) < 0.06
+
+
+@pytest.mark.parametrize('times', [1, 3, 8])
+def test_poses_without_twists_are_no_second_publisher(times):
+    drive = FilterDrive(twists=from_rest(winding(20, 25, speed=1.0), 25), rate_hz=25)
+    renewed, paths = np.arange(len(drive.stamps_ns)) // times * times, Paths()
+    for i, pose in enumerate(drive.reckoned[renewed].tolist()):
+        paths.add(i / 25, pose, 0.0, 0.0)
+        assert not paths.in_turn and not paths.aside
+
+
+def test_an_orientation_that_is_never_filled_is_left_to_the_twist():
+    drive, errors = FilterDrive(seconds=20, rate_hz=25), []
+    poses = drive.reckoned * [1.0, 1.0, 0.0]
+    outputs = fused_over(poses, drive.read, drive)
+    errors = [error for _, error, *_ in outputs]
+    assert np.mean(errors) < 0.03
+    entries = [
+        (stamp, (pose, (*twist, 0.0, 0.0)))
+        for stamp, pose, twist in zip(
+            drive.stamps_ns.tolist(), poses.tolist(), drive.read.tolist(), strict=True
+        )
+    ]
+    odometry, sentences, _ = to_odometry(entries, '/odom')
+    assert sentences == ['the orientation is never filled; the twist is integrated instead']
+    assert np.ptp(odometry.poses[:, 2]) > 1.0
 
 
 def test_poses_that_are_never_filled_and_a_robot_that_stands_go_on_by_the_twist():

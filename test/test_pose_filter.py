@@ -14,6 +14,7 @@ from sfa_localization.data.error_correlation import LEAST_M, ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.rig import Quantity, Rig
+from sfa_localization.data.run import integrate
 from sfa_localization.fusion.ekf import Ekf, replaced
 from sfa_localization.fusion.motion import DELAY, LOSS, SCALE, SIZE, Pace, Twist
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
@@ -283,6 +284,25 @@ def test_it_learns_bias_and_scale_and_beats_images_and_odometry():
     assert np.mean(errors) < 0.7 * alone.mean() and errors[-1] < drive.error(blind, -1)[0]
     assert fused.state.yaw_rate_bias == pytest.approx(0.03, abs=0.008)
     assert fused.state.wheel_scale == pytest.approx(1.08, abs=0.04)
+
+
+@pytest.mark.parametrize('factor', [0.6, 0.8, 1.3, 1.7])
+def test_it_learns_by_how_much_tracks_skid_in_turns(factor):
+    """The odometry turns so many times as far as the robot; nobody told the filter."""
+    drive, fused, errors = FilterDrive(seconds=60, rate_hz=25, **NOISY), started(), []
+    drive.read[:, 1] *= factor
+    drive.reckoned = integrate(drive.stamps_ns, drive.read)
+    for stamp_ns, kind, index in drive.events():
+        if kind:
+            fused.add_turned(stamp_ns, float(drive.poses[drive.pictures[index], 2]))
+        drive.give(fused, (stamp_ns, kind, index), True)
+        if not kind:
+            errors.append(drive.error(fused, index)[0])
+    assert fused.status.level is Level.LOCALISED and np.mean(errors) < 0.1
+    assert fused.state.turn_factor == pytest.approx(1 / factor, rel=0.06)
+    clock = fused.camera_clock
+    assert clock.turn_factor.value == pytest.approx(1 / factor, rel=0.06)
+    assert abs(clock.delay_s) < 0.05
 
 
 def test_images_that_lie_off_pull_less():

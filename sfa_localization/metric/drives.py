@@ -216,7 +216,7 @@ def _together(drives: Sequence[Quantity]) -> Quantity:
 
 
 def compare_with_map(checks: Sequence[MotionCheck], drives: Drives, result: MetricResult) -> None:
-    """Add the comparison of the map with the odometry, whose turns are corrected, to each drive's."""
+    """Add the comparison of the map with the odometry, with corrected turns, to each drive's."""
     for check, drive, track, images in zip(
         checks, drives.items, drives.tracks(), drives.image_poses(result), strict=True
     ):

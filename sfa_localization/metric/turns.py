@@ -94,7 +94,8 @@ def estimated(drives: Sequence[Headings]) -> list[Turns] | None:
     steps, prior = _Steps.of(drives), np.repeat([FACTOR_STD, BIAS_STD], len(drives)) ** -2
     if steps.correlation < ALIKE:
         return None
-    noise, turns, outlier = NOISE_FIRST, steps.odometry + steps.more, 1.0
+    noise, turns = NOISE_FIRST, steps.odometry + steps.more
+    outlier = np.ones(len(steps.short))
     more, counted = steps.summed(steps.more), steps.summed(steps.errors(steps.odometry))
     for _ in range(_ROUNDS):
         by_odometry = steps.sources[:, :2] @ noise[:2] + steps.bridged

@@ -184,10 +184,61 @@ def fill(m, x, quaternion, twist=True):
         m.twist.twist.linear.x = m.twist.twist.angular.z = 0.0
 
 
+def unoriented(m, _):
+    """A driver that fills position and twist only."""
+    m.pose.pose.orientation = type(m.pose.pose.orientation)(0.0, 0.0, 0.0, 1.0)
+
+
 def zeros_at_times(m, rng):
     """A driver that sends a message of zeros now and then."""
     if rng.random() < 0.02:
         fill(m, 0.0, (0, 0, 0, 1), twist=False)
+
+
+def stale(times):
+    """A driver that repeats each pose, and fills no twist."""
+    poses = []
+
+    def change(m, _):
+        poses.append(poses[-1] if len(poses) % times else m.pose.pose)
+        m.pose.pose, m.twist.twist.linear.x, m.twist.twist.angular.z = poses[-1], 0.0, 0.0
+
+    return {ODOMETRY: change}
+
+
+def counting(wheels):
+    """Odometry of wheels that count another way and turn than were driven."""
+    state = {}
+
+    def change(m, _):
+        place, q, now = m.pose.pose.position, m.pose.pose.orientation, stamp_of(m)
+        true = place.x + 1j * place.y, read_yaw(q)
+        before, (there, yaw), then = state.get('last', (true, true, now - 1))
+        turn = math.remainder(true[1] - before[1], 2 * math.pi)
+        way = ((true[0] - before[0]) * np.exp(-1j * (before[1] + turn / 2))).real
+        way, turn = wheels(way, turn)
+        there, seconds = there + way * np.exp(1j * (yaw + turn / 2)), (now - then) / SECOND_NS
+        state['last'] = true, (there, yaw + turn), now
+        place.x, place.y = float(there.real), float(there.imag)
+        q.z, q.w = math.sin((yaw + turn) / 2), math.cos((yaw + turn) / 2)
+        m.twist.twist.linear.x, m.twist.twist.angular.z = float(way / seconds), turn / seconds
+
+    return {ODOMETRY: change}
+
+
+def no_gyroscope():
+    """Changes that leave out the gyroscope."""
+    return {IMU: lambda m, _: []}
+
+
+def cut_nanoseconds(m, _):
+    """A driver that puts all nanoseconds into the field for those of a second."""
+    m.header.stamp.nanosec = stamp_of(m) % 2**32
+
+
+def columns(first, last):
+    """Panoramas from one column to another: beyond the width, columns are repeated."""
+    return seen(lambda image, rng: np.take(image, range(first, last), axis=1, mode='wrap'))
 
 
 def ahead(topic, seconds):
@@ -406,6 +457,46 @@ TROUBLES = {
     'odometry: single zeros': Trouble(
         lambda: {ODOMETRY: zeros_at_times},
         RIGHT_M, 'messages left out: pose beside the path',
+    ),
+    'odometry: poses five times, no twist': Trouble(
+        # Its poses are 0.1 s old on average, for which single images are compared with the truth.
+        lambda: stale(5), (0.11, 0.055), 'SFA, one', trains=False
+    ),
+    'odometry: no orientation': Trouble(
+        lambda: {ODOMETRY: unoriented},
+        RIGHT_M, 'the orientation is never filled; the twist is integrated',
+    ),
+    'odometry: tracks that skid, no gyroscope': Trouble(
+        lambda: counting(lambda way, turn: (way, 1.3 * turn)) | no_gyroscope(),
+        RIGHT_M, r'wheels: 0\.7. times the turns counted',
+    ),
+    'odometry: turns twice as far in the test': Trouble(
+        lambda: counting(lambda way, turn: (way, 2.0 * turn)),
+        RIGHT_M, 'SFA, one', trains=False,
+    ),
+    'odometry: half of the turns': Trouble(
+        lambda: counting(lambda way, turn: (way, 0.5 * turn)),
+        RIGHT_M, r'wheels: 2\.0. times the turns counted',
+    ),
+    'odometry: whole seconds': Trouble(
+        lambda: {ODOMETRY: lambda m, _: restamp(m, stamp_of(m) // SECOND_NS * SECOND_NS)},
+        None, 'drivers that stamp whole seconds: use the time of reception',
+    ),
+    'odometry: nanoseconds of 1e9 and more': Trouble(
+        lambda: {ODOMETRY: cut_nanoseconds}, None, 'stamps of 1e9 nanoseconds or more: use',
+    ),
+    'odometry: left encoder dead': Trouble(
+        lambda: counting(lambda way, turn: (way / 2 + 0.075 * turn, way / 0.3 + turn / 2)),
+        None, 'ground truth drives 2.* times as far as odometry',
+    ),
+    'panoramas of 330 degrees': Trouble(
+        lambda: columns(25, 575), (0.4, 0.25), 'gyroscope, as panoramas of 33. degrees would'
+    ),
+    'panoramas of 345 degrees': Trouble(
+        lambda: columns(12, 588), (0.25, 0.2), 'gyroscope, as panoramas of 34. degrees would'
+    ),
+    'panoramas of 400 degrees': Trouble(
+        lambda: columns(-33, 633), (0.45, 0.35), 'gyroscope, as panoramas of 40. degrees would'
     ),
     'odometry: quaternion of zeros': Trouble(
         lambda: {ODOMETRY: lambda m, _: fill(m, 0.0, (0, 0, 0, 0))},
