@@ -63,6 +63,8 @@ class OdometryTrack:
     count: Count
     bridged: Array
     """(N, 2) variances of the way ahead, m^2, and of the turns, rad^2, in bridged pauses."""
+    by_gyro: bool = False
+    """Whether a gyroscope measured the turns."""
     lever: complex = 0.0
     """Where the camera sits on the robot, ahead + i left, m."""
 
@@ -93,7 +95,7 @@ class OdometryTrack:
         part = summed(breaks).astype(np.int64)
         count = Count(len(stamps), dict(+skipped))
         sums = np.vstack([np.zeros(2), np.cumsum(unsure, axis=0)])
-        return cls(stamps, poses, part, summed(noise), count, sums)._turned(yaw)
+        return cls(stamps, poses, part, summed(noise), count, sums, by_gyro)._turned(yaw)
 
     @property
     def seconds(self) -> Array:

@@ -153,7 +153,6 @@ def check_motion(
         _judge_axes(check)
         _judge_following(check, sources, commands)
         _judge(check, 'turns')
-        _judge_width(check)
         _judge_clocks(check)
         if views is not None:
             clock = check.image_drift or Drift(0, turns.late_s if turns else 0.0, 0.0)
@@ -370,6 +369,7 @@ def _correct_gyro(check: MotionCheck, kind: str, text: str, factor: float) -> No
 
 def _judge_clocks(check: MotionCheck) -> None:
     """Correct the stamps of the gyroscope; the training corrects those of images."""
+    _judge_width(check)
     if check.gyro is not None and not check.odometry.trajectory.covers(check.gyro.stamps_ns).any():
         check.corrected.append(f'{GYRO}: stamped by another clock than the odometry; left out')
         check.gyro = None

@@ -42,6 +42,8 @@ NOISE_FIRST: Array = np.array([0.03, 0.3, 0.01, 0.05]) ** 2
 """From which they are fit: larger than that of any robot, so that no error is far at first."""
 NOISE_SPREAD: Array = np.array([3.0, 3.0, 1.0, 1.0])
 """Standard deviations of the logarithms of these."""
+GYRO_NOISE: Array = np.array([0.001, 0.005]) ** 2
+"""A and B of gyroscopes, where their spread is that of images: also cheap ones are no wheels."""
 FACTOR_STD, BIAS_STD = 0.3, 0.003
 """Priors: of the factor of wheels on any ground, and of a bias, rad/s."""
 FAR = 8.0
@@ -67,6 +69,8 @@ class Headings:
     way_m: Array
     bridged: Array
     """rad^2: variance of the odometry's yaw in bridged pauses."""
+    by_gyro: bool = False
+    """Whether `track` is by a gyroscope."""
 
     @classmethod
     def of(cls, track: OdometryTrack, stamps_ns: Stamps, images: Sequence[float]) -> Headings:
@@ -76,7 +80,8 @@ class Headings:
         part = track.part[np.searchsorted(track.stamps_ns[1:], stamps_ns, 'right')]
         way_m = np.interp(time_s, track.seconds, track.length)
         bridged = np.interp(time_s, track.seconds, track.bridged[:, 1])
-        return cls(time_s, yaw, np.unwrap(np.asarray(images, float)), part, way_m, bridged)
+        images = np.unwrap(np.asarray(images, float))
+        return cls(time_s, yaw, images, part, way_m, bridged, track.by_gyro)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +143,7 @@ class _Steps:
     unbroken: Mask
     short: Indices
     windows: Indices
+    by_gyro: bool
 
     @classmethod
     def of(cls, drives: Sequence[Headings]) -> _Steps:
@@ -156,7 +162,18 @@ class _Steps:
             for length in (FOLLOWED_M, REACH_M)
         )
         more = np.asarray(wrap_angle(images - odometry))
-        return cls(odometry, more, own, time_s, sources, steps('bridged'), unbroken, short, windows)
+        return cls(
+            odometry,
+            more,
+            own,
+            time_s,
+            sources,
+            steps('bridged'),
+            unbroken,
+            short,
+            windows,
+            all(drive.by_gyro for drive in drives),
+        )
 
     def errors(self, turns: Array) -> Array:
         """(M, 2 D): derivatives of turns (M,) rad by the factors and biases of the drives."""
@@ -190,12 +207,16 @@ class _Steps:
         in_windows = np.add.reduceat(residual, self.windows)[whole]
         squares = np.append(residual[single], in_windows) ** 2
 
+        usual, spread = NOISE.copy(), NOISE_SPREAD.copy()
+        if self.by_gyro:
+            usual[:2], spread[:2] = GYRO_NOISE, NOISE_SPREAD[2:]
+
         def cost(logarithms: Array) -> tuple[float, Array]:
             noise = np.exp(logarithms)
             variance = rows @ noise
-            ratio, beside = squares / variance, (logarithms - np.log(NOISE)) / NOISE_SPREAD
+            ratio, beside = squares / variance, (logarithms - np.log(usual)) / spread
             near = np.minimum(ratio, FAR**2)
-            slope = (1 - near) / variance @ rows * noise / 2 + beside / NOISE_SPREAD
+            slope = (1 - near) / variance @ rows * noise / 2 + beside / spread
             misfit = near * (1 + np.log(np.maximum(ratio / near, 1.0)))
             total = (np.log(variance) + misfit).sum() + beside @ beside
             return float(total) / 2, np.asarray(slope)
