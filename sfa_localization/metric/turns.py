@@ -50,8 +50,6 @@ FAR = 8.0
 """Standard deviations beyond which an error counts no more: images that match by chance."""
 ALIKE = 0.7
 """Images whose turns correlate less with those of the odometry measure another motion."""
-FAR = 8.0
-"""Standard deviations beyond which an error counts no more: images that match by chance."""
 # Rounds of weights and variances, from where they hardly change.
 _ROUNDS = 8
 _TINY = 1e-12
@@ -80,8 +78,8 @@ class Headings:
         part = track.part[np.searchsorted(track.stamps_ns[1:], stamps_ns, 'right')]
         way_m = np.interp(time_s, track.seconds, track.length)
         bridged = np.interp(time_s, track.seconds, track.bridged[:, 1])
-        images = np.unwrap(np.asarray(images, float))
-        return cls(time_s, yaw, images, part, way_m, bridged, track.by_gyro)
+        shown = np.unwrap(np.asarray(images, float))
+        return cls(time_s, yaw, shown, part, way_m, bridged, track.by_gyro)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +107,7 @@ def estimated(drives: Sequence[Headings]) -> list[Turns] | None:
         # turns estimated instead (instrumental variables).
         weight = steps.whole / (steps.summed(total) * outlier)
         weighted = steps.summed(steps.errors(turns)).T * weight
-        covariance = np.linalg.inv(weighted @ counted + np.diag(prior))
-        values = covariance @ (weighted @ more)
+        values = np.linalg.solve(weighted @ counted + np.diag(prior), weighted @ more)
         outlier = outlier_factor((more - counted @ values) ** 2 / steps.summed(total))
         corrected = steps.errors(steps.odometry) @ values
         residual = steps.more - corrected
@@ -118,6 +115,7 @@ def estimated(drives: Sequence[Headings]) -> list[Turns] | None:
         turns = steps.odometry + add
         noise = steps.noise(residual, noise)
     variance = by_odometry * np.where(steps.unbroken, 1 - by_odometry / total, 1.0)
+    covariance = np.linalg.inv((counted.T * weight) @ counted + np.diag(prior))
     stds, ends = np.sqrt(np.diag(covariance)), np.cumsum([len(drive.track) - 1 for drive in drives])
     parts = zip(np.split(add, ends[:-1]), np.split(variance, ends[:-1]), values, stds, strict=False)
     return [
@@ -162,18 +160,9 @@ class _Steps:
             for length in (FOLLOWED_M, REACH_M)
         )
         more = np.asarray(wrap_angle(images - odometry))
-        return cls(
-            odometry,
-            more,
-            own,
-            time_s,
-            sources,
-            steps('bridged'),
-            unbroken,
-            short,
-            windows,
-            all(drive.by_gyro for drive in drives),
-        )
+        by_gyro = all(drive.by_gyro for drive in drives)
+        given = sources, steps('bridged'), unbroken, short, windows, by_gyro
+        return cls(odometry, more, own, time_s, *given)
 
     def errors(self, turns: Array) -> Array:
         """(M, 2 D): derivatives of turns (M,) rad by the factors and biases of the drives."""

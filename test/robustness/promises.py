@@ -45,13 +45,13 @@ PROMISES = {
         ('odometry in bundles, or stamped on reception', 'its poses say how far the robot moved'),
     'test_pose_filter.py::test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed':
         ('images of another clock', 'DEGRADED, with the difference of the clocks'),
-    # Images.
     'test_odometry_steps.py::test_poses_without_twists_are_no_second_publisher':
         ('poses without twists, each sent several times', 'used as they are'),
     'test_odometry_steps.py::test_an_orientation_that_is_never_filled_is_left_to_the_twist':
         ('an orientation that is never filled', 'the twist is used'),
     'test_pose_filter.py::test_it_learns_by_how_much_tracks_skid_in_turns':
         ('wheels or tracks that skid in turns', 'their factor is learned'),
+    # Images.
     'test_pose_filter.py::test_a_spike_is_rejected_and_moves_nothing':
         ('one wrong image', 'outside the gate: rejected'),
     'test_pose_filter.py::'
