@@ -381,6 +381,7 @@ class EkfNode(LocalizationNode):
             values['yaw-rate bias [rad/s]'] = f'{state.yaw_rate_bias:.5f}'
             values['wheel scale'] = f'{state.wheel_scale:.4f}'
             values['way lost in turns [m/rad]'] = f'{state.turn_loss:.3f}'
+            values['turns over those counted'] = f'{state.turn_factor:.3f}'
         clock = self.filter.camera_clock
         if clock.is_estimated:
             values['camera delay [s]'] = f'{clock.delay_s:.3f}'
