@@ -23,7 +23,7 @@ class FilterConfig(Settings):
     initial_yaw_std: float = setting(
         0.1, 'standard deviation of the heading at the start', unit='rad', low=1e-4, high=3.2)
     speed_std: float = setting(
-        0.03, 'standard deviation of a speed whose message has no covariance', unit='m/s',
+        0.05, 'standard deviation of a speed whose message has no covariance', unit='m/s',
         low=1e-4, high=10.0, live=True)
     rate_std: float = setting(
         0.02, 'standard deviation of a turn rate whose message has no covariance', unit='rad/s',

@@ -202,7 +202,7 @@ def rig_of(drives: Drives, segments: Segments) -> Rig:
     return Rig(
         **segments.mount.quantities,
         camera_delay=usual.camera_delay._replace(value=float(np.median(delays or [0.0]))),
-        wheel_scale=Quantity(float(np.mean([way.scale for way in ways])), scale_std),
+        wheel_scale=_together([Quantity(way.scale, scale_std) for way in ways]),
         turn_loss=_together([way.loss for way in ways]),
         speed_offset=_together([way.offset for way in ways]),
         turn_factor=turn_factor._replace(std=math.hypot(turn_factor.std, TURN_FACTOR_STD)),
