@@ -11,6 +11,7 @@ from cylinder_worlds import Spheres, recipe, run_in, wander
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, integrate
+from sfa_localization.keyframes.closures import Closures
 from sfa_localization.metric.dead_reckoning import BRIDGE_MAX_S, OdometryTrack
 from sfa_localization.metric.drives import rig_of
 from sfa_localization.metric.settings import SegmentConfig
@@ -43,7 +44,7 @@ def turns_of(stamps, twists, measured, image_std=0.002, parallax=0.0, sign=1.0, 
     seen += parallax * true[:, 0]  # an angle that depends on the place
     track = OdometryTrack.of(measured, CONFIG)
     headings = Headings.of(track, stamps[::EVERY], (sign * wrap_angle(seen)).tolist())
-    turns = estimated([headings])
+    turns = estimated([headings], Closures.none())
     return turns and turns[0], np.unwrap(true[:, 2]), headings.track
 
 
@@ -81,7 +82,21 @@ def test_images_that_turn_otherwise_than_the_robot_change_nothing():
     stamps, twists = robot()
     other = integrate(stamps, robot(seed=1)[1])[::EVERY, 2]
     track = OdometryTrack.of(odometry(stamps, twists), CONFIG)
-    assert estimated([Headings.of(track, stamps[::EVERY], other.tolist())]) is None
+    headings = Headings.of(track, stamps[::EVERY], other.tolist())
+    assert estimated([headings], Closures.none()) is None
+
+
+def test_where_closures_show_that_wheels_turn_better_images_change_nothing():
+    """As of a robot that hides a part of the view: its images turn by less than it does."""
+    stamps, twists = robot()
+    true = integrate(stamps, twists)[::EVERY, 2]
+    rows = np.random.default_rng(0).integers(0, len(true), (200, 2))
+    closures = Closures(rows, wrap_angle(np.diff(true[rows])[:, 0]))
+    good = OdometryTrack.of(odometry(stamps, twists, 1.0, 0.002), CONFIG)
+    bad = OdometryTrack.of(odometry(stamps, twists, 1.2, 0.02), CONFIG)
+    for track, images, used in ((good, 0.9 * true, False), (bad, true, True)):
+        headings = Headings.of(track, stamps[::EVERY], images.tolist())
+        assert (estimated([headings], closures) is not None) == used
 
 
 def test_images_that_match_by_chance_do_not_turn_a_robot_of_good_wheels():
@@ -90,7 +105,7 @@ def test_images_that_match_by_chance_do_not_turn_a_robot_of_good_wheels():
     true = integrate(stamps, twists)[::EVERY, 2]
     wrong = np.cumsum(np.where(np.arange(len(true)) % 50 == 7, 2.0, 0.0))
     headings = Headings.of(track, stamps[::EVERY], wrap_angle(true + wrong).tolist())
-    turns = estimated([headings])[0]
+    turns = estimated([headings], Closures.none())[0]
     assert spread(headings.track + turns.add - np.unwrap(true)) < 0.5
 
 

@@ -88,7 +88,7 @@ class Drives:
         """Dead reckoning of each drive, with the turns of its images where these are better."""
         runs = [drive.run for drive in self.items]
         tracks = [OdometryTrack.of(run.odometry, self.config, run.yaw_rate) for run in runs]
-        turns = estimated(self._headings(tracks))
+        turns = estimated(self._headings(tracks), self.closures)
         if turns is None:
             return tracks
         changes = zip(tracks, self.items, turns, strict=True)
@@ -102,7 +102,7 @@ class Drives:
         show them."""
         config = replace(self.config, yaw_source='odometry')
         tracks = [OdometryTrack.of(drive.run.odometry, config) for drive in self.items]
-        return [each.factor for each in estimated(self._headings(tracks)) or []]
+        return [each.factor for each in estimated(self._headings(tracks), self.closures) or []]
 
     def _headings(self, tracks: Sequence[OdometryTrack]) -> list[Headings]:
         pairs = zip(tracks, self.items, strict=True)

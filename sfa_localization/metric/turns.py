@@ -29,6 +29,7 @@ from sfa_localization.data.geometry import Array, Indices, Mask, wrap_angle
 from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Stamps
 from sfa_localization.data.statistics import outlier_factor
+from sfa_localization.keyframes.closures import Closures
 from sfa_localization.metric.dead_reckoning import OdometryTrack, summed
 
 REACH_M = 4.0
@@ -44,6 +45,8 @@ NOISE_SPREAD: Array = np.array([3.0, 3.0, 1.0, 1.0])
 """Standard deviations of the logarithms of these."""
 GYRO_NOISE: Array = np.array([0.001, 0.005]) ** 2
 """A and B of gyroscopes, where their spread is that of images: also cheap ones are no wheels."""
+CLOSURES_MIN = 30
+"""Fewer closures do not show whether images turn better."""
 FACTOR_STD, BIAS_STD = 0.3, 0.003
 """Priors: of the factor of wheels on any ground, and of a bias, rad/s."""
 FAR = 8.0
@@ -92,8 +95,12 @@ class Turns:
     factor: Quantity
 
 
-def estimated(drives: Sequence[Headings]) -> list[Turns] | None:
-    """The turns of each drive; None where images turn otherwise than the odometry."""
+def estimated(drives: Sequence[Headings], closures: Closures) -> list[Turns] | None:
+    """The turns of each drive; None where images turn otherwise than the odometry, and where
+    `closures`, which number the images of all drives, show that the odometry turns better.
+    """
+    if _odometry_is_better(drives, closures):
+        return None
     steps, prior = _Steps.of(drives), np.repeat([FACTOR_STD, BIAS_STD], len(drives)) ** -2
     if steps.correlation < ALIKE:
         return None
@@ -122,6 +129,24 @@ def estimated(drives: Sequence[Headings]) -> list[Turns] | None:
         Turns(summed(added), summed(variances), Quantity(1 + float(value), float(std)))
         for added, variances, value, std in parts
     ]
+
+
+def _odometry_is_better(drives: Sequence[Headings], closures: Closures) -> bool:
+    """Whether odometry misses the turns of closures by less than images of either sign."""
+    start, misses = 0, [np.zeros((3, 0))]
+    for drive in drives:
+        rows = closures.images - start
+        inside = np.flatnonzero(((rows >= 0) & (rows < len(drive.track))).all(1))
+        inside = inside[np.ptp(drive.part[rows[inside]], axis=1) == 0]
+        headings = np.stack([drive.track, drive.images, -drive.images])
+        turned = np.diff(headings[:, rows[inside]])[..., 0]
+        misses.append(np.asarray(wrap_angle(turned - closures.turn[inside])))
+        start += len(drive.track)
+    miss = np.abs(np.concatenate(misses, axis=1))
+    if miss.shape[1] < CLOSURES_MIN:
+        return False
+    by_odometry, same, opposite = np.median(miss, axis=1).tolist()
+    return bool(by_odometry < min(same, opposite))
 
 
 @dataclass(frozen=True, slots=True)
