@@ -21,7 +21,7 @@ from sfa_localization.data.messages import LARGEST_SCALE
 
 CAMERA_STD_M = 0.5
 """Prior of each coordinate of a camera on a robot of unknown size."""
-TURN_FACTOR_STD = 0.03
+TURN_FACTOR_STD = 0.04
 """Of true over counted turns, also of a known robot on other ground: wheels of eleven real drives
 differed by so much; tracks that skid by half are known by the turns of images."""
 UNKNOWN_YAW_STD = math.pi / math.sqrt(3)

@@ -22,7 +22,7 @@ from sfa_localization.data.events import (
     whole_leap,
 )
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.data.rig import TURN_FACTOR_STD, Quantity
+from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Odometry, Stamps
 
 NEAR_NS = 150_000_000
@@ -37,7 +37,6 @@ _IN_TRANSIT_NS, _REMEMBERED_NS = 1_000_000_000, 10_000_000_000
 _FACTORS: Array = np.exp(np.linspace(-0.75, 0.75, 11))
 """True over counted turns: tracks skid, by half at most."""
 _SIGNED: Array = np.concatenate([_FACTORS, -_FACTORS])[:, None]  # columns may grow either way
-_UNLIKELY: Array = (np.log(np.abs(_SIGNED)) / TURN_FACTOR_STD) ** 2 / 2  # cost of factors
 _WINDOW_NS = round(CLOCK_RANGE_S * 1e9) + 100_000_000
 # Residuals beyond _OUTLIER times _SCALE_RAD are mismatches, and clipped; delays whose costs differ
 # by less than _ALIKE fit equally well.
@@ -170,19 +169,18 @@ class CameraClockFinder:
 
     def _estimate(self) -> CameraClock:
         """The delay of the least cost, unless it lies at the border or the turns do not fix it."""
-        cost = self._cost + _UNLIKELY
-        side, best = np.unravel_index(int(np.argmin(cost)), cost.shape)
+        side, best = np.unravel_index(int(np.argmin(self._cost)), self._cost.shape)
         turns, size, error = (a[side, best] for a in (self._turns, self._size, self._error))
         if turns < _TURNS_MIN or error > size / 2 or not 0 < best < len(_GRID) - 1:
             return CameraClock()
         scale = max(error / turns / _MEAN_OF_NORMAL, _SCALE_MIN_RAD)
         std = _CAUTION * scale / np.sqrt(max(self._power[side, best], 1e-12))
         # While a robot turns steadily, many delays fit nearly as well as the best.
-        alike = _GRID[cost[side] <= cost[side, best] + _ALIKE]
+        alike = _GRID[self._cost[side] <= self._cost[side, best] + _ALIKE]
         std = max(std, float(np.ptp(alike)) / 4)
         if std > _STD_MAX_S:
             return CameraClock()
-        below, least, above = cost[side, best - 1 : best + 2]
+        below, least, above = self._cost[side, best - 1 : best + 2]
         # Two slopes meet in the minimum of a sum of absolute values.
         steepest = max(below - least, above - least)
         part = (below - above) / (2 * steepest) if steepest > 0 else 0.0

@@ -44,6 +44,9 @@ OUTLYING = {2: 3.2188758248682006, 3: 4.641627676087445}
 (chi-square). Those beyond the first are rejected, those beyond the second lose weight."""
 LEAST_STD = 1e-3
 """Of a delay, s, or a turn factor, before turns contradict it."""
+FACTOR_STDS = 4.0
+"""Standard deviations by which a factor of turns contradicts: images that are half hidden turn by
+a fifth too much."""
 ALIKE_SHARE = 0.2
 """Where neighbors share less of their errors, positions are those of a sensor without outliers."""
 
@@ -120,7 +123,7 @@ class Ekf:
             return placed._replace(memory=Memory(), path=path)
         belief = replaced(belief, motion.DELAY, event.late)
         factor = Quantity(event.turn_factor.value - 1.0, event.turn_factor.std)
-        return self._measured(replaced(belief, motion.TURN, factor), event)
+        return self._measured(replaced(belief, motion.TURN, factor, FACTOR_STDS), event)
 
     # Predict.
 
@@ -283,13 +286,15 @@ class Ekf:
         return placed._replace(memory=memory, path=path)
 
 
-def replaced(belief: Belief, row: int, by_turns: Quantity) -> Belief:
+def replaced(
+    belief: Belief, row: int, by_turns: Quantity, significant: float = SIGNIFICANT_STDS
+) -> Belief:
     """What the turns of the images show replaces a row of the state where both contradict each
     other. The rest of the state follows by its regression on that row (Jeffrey's rule).
     """
     variance = max(float(belief.covariance[row, row]), LEAST_STD**2)
     change = by_turns.value - float(belief.mean[row])
-    if abs(change) <= SIGNIFICANT_STDS * math.hypot(by_turns.std, math.sqrt(variance)):
+    if abs(change) <= significant * math.hypot(by_turns.std, math.sqrt(variance)):
         return belief
     by_row = belief.covariance[row] / variance
     by_row[row] = 1.0
