@@ -45,6 +45,8 @@ NOISE_SPREAD: Array = np.array([3.0, 3.0, 1.0, 1.0])
 """Standard deviations of the logarithms of these."""
 GYRO_NOISE: Array = np.array([0.001, 0.005]) ** 2
 """A and B of gyroscopes, where their spread is that of images: also cheap ones are no wheels."""
+APART_M = 1.0
+"""Images that are farther apart show other things, and match by chance."""
 CLOSURES_MIN = 30
 """Fewer closures do not show whether images turn better."""
 FACTOR_STD, BIAS_STD = 0.3, 0.003
@@ -154,7 +156,7 @@ class _Steps:
     """The M steps from image to image of all D drives, rad: turns of the odometry, and how much
     `more` images turn. `sources` (M, 4) multiply the noise A to P, rad^2 in `bridged` pauses add
     to it; `short` and `windows` are the first steps of 1 m and of 4 m. Where the odometry breaks,
-    steps are not `unbroken`."""
+    or images are far apart, steps are not `unbroken`."""
 
     odometry: Array
     more: Array
@@ -174,8 +176,9 @@ class _Steps:
             columns: list[NDArray[Any]] = [np.diff(getattr(drive, name)) for drive in drives]
             return np.concatenate(columns)
 
-        odometry, images, unbroken = steps('track'), steps('images'), steps('part') == 0
+        odometry, images = steps('track'), steps('images')
         time_s, way_m = steps('time_s'), steps('way_m')
+        unbroken = (steps('part') == 0) & (way_m <= APART_M)
         images = wrap_angle(images if images @ odometry >= 0 else -images)
         drive = np.repeat(np.arange(len(drives)), [len(each.track) - 1 for each in drives])
         own = np.equal.outer(drive, np.arange(len(drives)))
