@@ -220,9 +220,7 @@ def compare_with_map(checks: Sequence[MotionCheck], drives: Drives, result: Metr
     for check, drive, track, images in zip(
         checks, drives.items, drives.tracks(), drives.image_poses(result), strict=True
     ):
-        odometry = drive.run.odometry
-        turned = track.poses if len(track.poses) == len(odometry.poses) else odometry.poses
-        pair = compare_map(replace(odometry, poses=turned), *images)
+        pair = compare_map(replace(drive.run.odometry, poses=track.poses), *images)
         check.pairs += [pair] if pair else []
 
 

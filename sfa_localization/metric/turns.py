@@ -108,17 +108,19 @@ def estimated(drives: Sequence[Headings], closures: Closures) -> list[Turns] | N
         return None
     noise, turns = NOISE_FIRST, steps.odometry + steps.more
     outlier = np.ones(len(steps.short))
-    more, counted = steps.summed(steps.more), steps.summed(steps.errors(steps.odometry))
+    errors = steps.errors(steps.odometry)
+    more, counted = steps.summed(steps.more), steps.summed(errors)
     for _ in range(_ROUNDS):
         by_odometry = steps.sources[:, :2] @ noise[:2] + steps.bridged
         total = by_odometry + steps.sources[:, 2:] @ noise[2:]
         # Noise of the turns counted would make their factor too small: they are multiplied by the
         # turns estimated instead (instrumental variables).
-        weight = steps.whole / (steps.summed(total) * outlier)
+        in_windows = steps.summed(total)
+        weight = steps.whole / (in_windows * outlier)
         weighted = steps.summed(steps.errors(turns)).T * weight
         values = np.linalg.solve(weighted @ counted + np.diag(prior), weighted @ more)
-        outlier = outlier_factor((more - counted @ values) ** 2 / steps.summed(total))
-        corrected = steps.errors(steps.odometry) @ values
+        outlier = outlier_factor((more - counted @ values) ** 2 / in_windows)
+        corrected = errors @ values
         residual = steps.more - corrected
         add = corrected + steps.unbroken * by_odometry / total * residual
         turns = steps.odometry + add
