@@ -36,9 +36,10 @@ from sfa_localization.data.geometry import (
     wrap_angle,
 )
 from sfa_localization.data.progress import progress_over
+from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import Count, Run, Stamps, Trajectory
 from sfa_localization.data.threads import one_core
-from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
+from sfa_localization.fusion.camera_clock import SIGNIFICANT_STDS, CameraClock, camera_clock
 from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.fusion.odometry import COAST_S
 from sfa_localization.fusion.pose_filter import PoseFilter, State
@@ -46,12 +47,14 @@ from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
+from sfa_localization.keyframes.closures import Closures
 from sfa_localization.localizer import Localizer
-from sfa_localization.metric.dead_reckoning import OdometryTrack
+from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
 from sfa_localization.metric.motion_check import MotionCheck, check_motion
 from sfa_localization.metric.motion_clocks import Drift
 from sfa_localization.metric.motion_truth import TruePoses, true_poses
 from sfa_localization.metric.settings import SegmentConfig
+from sfa_localization.metric.turns import Headings, estimated
 from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
@@ -130,7 +133,8 @@ def evaluate(
         drives.append(_located(path, Observer(model, watch), here, progress))
         recipe = replace(recipe, origin=drives[-1].run.origin)
     localizer = Localizer(model, config, watch, Smoother if smooth else PoseFilter)
-    drives.append(_located(bag, localizer.observer, recipe, progress))
+    usual = np.median([drive.true.offset for drive in drives] or [(0.0, 0.0, 0.0)], axis=0)
+    drives.append(_located(bag, localizer.observer, recipe, progress, usual.tolist()))
     aligned_on = 'nothing: coordinates of the map'
     if transform is None:
         aligned_on = ', '.join(map(str, align_bags or [bag]))
@@ -183,9 +187,8 @@ def observed(
     run = _read(bag, recipe, progress, want_truth)
     observations = _observations(run, observer, progress)
     if want_truth:
-        _, true = _compared(
-            run, _turns(run, observations), OpenLoop.of(run.odometry.twists).repeats
-        )
+        open_loop = OpenLoop.of(run.odometry.twists).repeats
+        _, true, _ = _compared(run, _turns(run, observations), open_loop, observer.model.rig)
         for text in true.sentences:
             logger.warning('%s: %s', run.name, text)
         run = replace(run, ground_truth=true.poses)
@@ -225,36 +228,68 @@ def _read(bag: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Run:
 
 
 def _compared(
-    run: Run, turns: tuple[Stamps, Array], open_loop: bool
-) -> tuple[MotionCheck, TruePoses]:
-    """The comparison of the sources of motion, and the poses of base_link by the ground truth, as
-    compared with the odometry. Raises DataError for the truth of another drive.
+    run: Run,
+    turns: tuple[Stamps, Array],
+    open_loop: bool,
+    rig: Rig,
+    usual: Sequence[float] = (0.0, 0.0, 0.0),
+) -> tuple[MotionCheck, TruePoses, CameraClock]:
+    """The comparison of the sources of motion, the poses of base_link by the ground truth, as
+    compared with the odometry, corrected as in training, and the camera's clock. Raises DataError
+    for the truth of another drive.
     """
     assert run.ground_truth is not None
     check = check_motion(run.odometry, turns, run.yaw_rate, commands=open_loop)
     track = OdometryTrack.of(check.odometry, SegmentConfig(), check.gyro)
+    clock, (stamps_ns, headings) = camera_clock(run.odometry, *turns), turns
+    stamps_ns = stamps_ns - clock.delay_ns
+    shown = [Headings.of(track, stamps_ns, headings.tolist())] if len(stamps_ns) > 1 else []
+    for turns_of in (shown and estimated(shown, Closures.none())) or ():
+        track = track.corrected(stamps_ns, turns_of.add, turns_of.variance)
+    track = track.driven(Way(rig.wheel_scale.value, rig.turn_loss, rig.speed_offset))
     try:
-        true = true_poses(run.ground_truth, track, check.confirmed, open_loop)
+        true = true_poses(run.ground_truth, track, check.confirmed, open_loop, usual)
     except DataError as error:
         raise DataError(f'{run.name}: {error}') from None
-    return check, true
+    return check, true, clock
 
 
-def _located(bag: Path, observer: Observer, recipe: Recipe, progress: bool) -> _Located:
-    """Locate the images of a bag. Raises BagError or DataError."""
+def _located(
+    bag: Path,
+    observer: Observer,
+    recipe: Recipe,
+    progress: bool,
+    usual: Sequence[float] = (0.0, 0.0, 0.0),
+) -> _Located:
+    """Locate the images of a bag; the `usual` offset of the truth is that of other drives. Raises
+    BagError or DataError.
+    """
     run = _read(bag, recipe, progress)
     observations = _observations(run, observer, progress)
     usable = [observation for observation in observations if not observation.problem]
     if not usable:
         raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
     turns, open_loop = _turns(run, observations), OpenLoop.of(run.odometry.twists).repeats
-    check, true = _compared(run, turns, open_loop)
-    clock = camera_clock(run.odometry, *turns)
+    check, true, clock = _compared(run, turns, open_loop, observer.model.rig, usual)
     late = check.image_drift or Drift(0, clock.delay_ns * 1e-9, 0.0)
     if open_loop:  # the robot is late, not the images
         late = Drift(0, 0.0, 0.0)
-    sentences = (*check.timing, *true.sentences)
+    sentences = (
+        *check.timing,
+        *_other_turns(clock.turn_factor, observer.model.rig),
+        *true.sentences,
+    )
     return _Located(run, observations, true, _track(usable, late), clock, sentences)
+
+
+def _other_turns(shown: Quantity, rig: Rig) -> list[str]:
+    """A sentence if the robot turns otherwise than in training, for each turn counted."""
+    known = rig.turn_factor
+    beside = abs(shown.value - known.value)
+    if beside <= SIGNIFICANT_STDS * math.hypot(shown.std, known.std):
+        return []
+    times = f'{shown.value:.2f} times the turns counted'
+    return [f'wheels: {times}, {known.value:.2f} times in training; the filter learns it']
 
 
 def _counts(

@@ -17,9 +17,11 @@ from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.cli import main
 from sfa_localization.config import write_config
 from sfa_localization.data.geometry import rotation
+from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion import pose_filter
 from sfa_localization.fusion.belief import DrivenPath
+from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.fusion.health import health_of
 from sfa_localization.metric.motion_truth import TruePoses
 from sfa_localization.place_model import PlaceModel
@@ -119,6 +121,17 @@ def test_what_was_corrected_of_the_truth_is_said_and_headings_it_lacks_are_not_j
     assert 'drive: ground truth has no headings' in said and 'heading error' not in said
     assert figures['ekf']['yaw_deg'] is None and figures['ekf']['mean'] < 0.1
     assert 'has no measured points, so that its coordinates are its own' in caplog.text
+
+
+@pytest.mark.parametrize(('factor', 'told'), [(0.5, True), (0.98, False)])
+def test_turns_that_are_counted_otherwise_than_in_training_are_told(
+    factor, told, bag, tmp_path, monkeypatch
+):
+    clock = CameraClock(turn_factor=Quantity(factor, 0.01))
+    monkeypatch.setattr(evaluation, 'camera_clock', lambda *_: clock)
+    told_as = 'drive: wheels: 0.50 times the turns counted, 1.00 times in training; the filter'
+    corrections = ' '.join(evaluated(bag, tmp_path)['corrections'])
+    assert (told_as in corrections) == told
 
 
 def spread_out(seed, covariance, count=4000):

@@ -20,14 +20,21 @@ MAP = 30 - 10j, 2.0
 """Where the odometry's frame lies in the map, and how it is turned."""
 
 
-def shows(late_s=0.0, lever=0j, turned=0.0, scale=1.0):
-    """What an image shows at a sample of the path (N, 3): place in its frame, and yaw, or None."""
+def shows(late_s=0.0, lever=0j, turned=0.0, scale=1.0, factor=1.0):
+    """What an image shows at a sample of the path (N, 3): place in its frame, and yaw, or None.
+    The robot turns `factor` times as far as the path.
+    """
 
     def camera(poses, i):
         at = max(i - round(late_s * RATE_HZ), 0)
         if at >= len(poses):
             return None
         x, y, yaw = poses[at]
+        if factor != 1.0:
+            yaws = factor * poses[: at + 1, 2]
+            steps = np.hypot(*np.diff(poses[: at + 1, :2], axis=0).T)
+            way = steps @ np.exp(1j * (yaws[1:] + yaws[:-1]) / 2)
+            x, y, yaw = way.real, way.imag, yaws[-1]
         return scale * complex(x, y) + cmath.exp(1j * yaw) * lever, yaw + turned
 
     return camera
@@ -77,6 +84,8 @@ FAULTS = {
     'turned': (shows(turned=math.radians(40)), 'turned', math.radians(40), 'degrees'),
     'less far': (shows(scale=0.5), 'scale', 0.5, '0.5 times'),
     'farther': (shows(scale=2.0), 'scale', 2.0, 'times as far'),
+    'tracks that skid': (shows(factor=0.7), 'wheels', 0.7, 'times as far as the odometry'),
+    'turns counted by half': (shows(factor=1.5), 'wheels', 1.5, 'do the wheels skid'),
     'unrelated': (anywhere, 'unrelated', 0.0, 'different motions'),
 }
 
@@ -85,7 +94,7 @@ FAULTS = {
 @pytest.mark.parametrize('name', FAULTS)
 def test_each_fault_is_found_with_its_size_and_named(name, seed):
     camera, fault, size, said = FAULTS[name]
-    health = health_of(*drive(camera=camera, seed=seed))
+    health = health_of(*drive(turn=1.0 if fault == 'wheels' else 0.5, camera=camera, seed=seed))
     assert health.well < 1 - LIKELY
     assert health.fault == fault and abs(health.size - size) < 0.25 * max(abs(size), 1.0)
     assert said in health.problems[0] and len(health.problems) == 1
@@ -93,7 +102,8 @@ def test_each_fault_is_found_with_its_size_and_named(name, seed):
 
 @pytest.mark.parametrize('camera', [
     shows(late_s=0.2), shows(late_s=-0.2), shows(lever=0.25 + 0j), shows(lever=0.25j),
-    shows(turned=math.radians(6)), shows(scale=0.9), shows(scale=1.1),
+    shows(factor=0.98), shows(factor=1.02), shows(turned=math.radians(6)), shows(scale=0.9),
+    shows(scale=1.1),
     lambda *at: (anywhere if at[1] // EVERY % 4 == 1 else shows())(*at),  # a quarter of the images
 ])  # fmt: skip
 def test_what_moves_the_robot_by_little_is_no_fault(camera):

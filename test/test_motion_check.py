@@ -433,6 +433,16 @@ def test_a_faulty_truth_is_corrected(name):
     assert np.abs(wrap_angle(frame.apply_yaw(poses[:, 2]) - right[:, 2])).max() < np.deg2rad(10.0)
 
 
+def test_a_short_drive_has_the_offset_of_the_truth_of_other_drives_if_it_fits():
+    """Too short to show it alone."""
+    track, truth = with_truth(lines=2)
+    late = marked(truth, 0.05)
+    alone, known = true_poses(late, track), true_poses(late, track, usual=(0.0, 0.0, 0.05))
+    assert not alone.sentences and 'is stamped 0.05 s late' in known.sentences[0]
+    assert known.offset == pytest.approx((0.0, 0.0, 0.05))
+    assert true_poses(truth, track, usual=(0.0, 0.0, 0.05)) == TruePoses(truth)
+
+
 @pytest.mark.parametrize('name', DRIVES)
 def test_a_right_truth_stays_as_it_is(name):
     run = drive(DRIVES[name][0], start=DRIVES[name][1], yaw_noise=0.2, speed_noise=0.2, seed=1)

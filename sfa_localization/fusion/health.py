@@ -7,6 +7,7 @@ well, one rigid transform T lays the path on the images; or another hypothesis e
 
     as it is    z_i = T d(t_i) + noise
     late        z_i = T d(t_i - tau): images show the robot of tau seconds ago, or of later
+    wheels      z_i = T d_f(t_i): the robot turned f times as far as the odometry
     lever       z_i = T (d(t_i) + R(h_i) l): the camera sits l beside its place on the robot
     turned      headings of images are off by one angle
     scale       images move s times as far as the odometry
@@ -14,8 +15,8 @@ well, one rigid transform T lays the path on the images; or another hypothesis e
 
 The noise is that of the images and of the odometry's drift; a share of outliers lies anywhere.
 Neighboring images err alike: all together count as about one a meter. T is eliminated in closed
-form (weighted: Umeyama 1991) and by Laplace's method, tau by a sum over a grid. The filter's state
-does not depend on any of this.
+form (weighted: Umeyama 1991) and by Laplace's method, tau and f by sums over grids. The filter's
+state does not depend on any of this.
 """
 
 from __future__ import annotations
@@ -47,6 +48,9 @@ CAUTION, FLOOR_M, FLOOR_RAD, YAW_DRIFT = 4.0, 0.05, 0.02, 0.02
 one place share; heading error of the odometry, rad per m."""
 DELAYS: Array = np.r_[-1.5:-0.2:0.3, 0.3, 0.6 : LONGEST_DELAY_S + 0.1 : 0.4]
 """Grid of delays, s, in addition to the compensated one."""
+FACTORS: Array = np.exp(np.delete(np.arange(-10, 11), 10) * 0.05)
+"""Grid of turn factors, in addition to the learned one: tracks skid. A twentieth of the turns in a
+window is about the heading error that images allow."""
 LONGEST_M = 16.0
 """An estimate that was placed anew again and again is confirmed over this distance at most."""
 _ANYWHERE = 1 / (100.0 * 2 * math.pi)
@@ -91,6 +95,8 @@ def _sentence(fault: str, size: complex) -> str:
     if fault == 'turned':
         degrees = math.degrees(size.real)
         return f'images look {degrees:.0f} degrees off the motion: was the camera turned?'
+    if fault == 'wheels':
+        return f'images turn {size.real:.1f} times as far as the odometry: do the wheels skid?'
     if fault == 'scale':
         return f'images move {size.real:.1f} times as far as the odometry'
     return 'images and odometry show different motions'
@@ -131,6 +137,7 @@ class _Window:
 
     def __init__(self, path: DrivenPath, fixes: Sequence[PositionFix]) -> None:
         images, newest_ns = Columns(fixes), fixes[-1].stamp_ns
+        self._is_recent = images.behind_m <= AGREEING_M
         self._seconds, self._places = (images.stamps_ns - newest_ns) * 1e-9, images.place
         self._looks, yaw_drift = np.exp(1j * images.yaw), (YAW_DRIFT * images.behind_m) ** 2
         self._variance = CAUTION * images.variance + FLOOR_M**2 + images.drift
@@ -145,15 +152,22 @@ class _Window:
     def hypotheses(self) -> list[_Hypothesis]:
         """All, with log odds up to a constant."""
         rows, yaws, delays = self._paths()
+        turned_rows, turned_yaws = self._turned_paths(rows[0], yaws[0])
+        rows = np.concatenate([rows, turned_rows, np.repeat(rows[:1], 3, 0)])
+        yaws = np.concatenate([yaws, turned_yaws, np.repeat(yaws[:1], 3, 0)])
         off = np.abs(rows[:, -1] - rows[0, -1]) > HARMLESS_M
         off |= np.abs(yaws[:, -1] - yaws[0, -1]) > HARMLESS_RAD
-        rows, yaws = (np.concatenate([x, np.repeat(x[:1], 3, 0)]) for x in (rows, yaws))
         logs, (lever, turned, scale) = self._fitted(rows, yaws)
         prior, late_prior = math.log(PRIOR), math.log(LATE_PRIOR / len(DELAYS))
-        as_it_is = math.log(1 - LATE_PRIOR - 4 * PRIOR)
+        wheels_prior = math.log(PRIOR / len(FACTORS))
+        as_it_is = math.log(1 - LATE_PRIOR - 5 * PRIOR)
         unrelated = self._power * len(self._places) * math.log(_ANYWHERE)
         of_scale = abs(scale - 1) * AGREEING_M > HARMLESS_M
-        of_delays = zip(logs[1:-3] + late_prior, delays[1:], off[1:], strict=True)
+        late, wheels = slice(1, len(delays)), slice(len(delays), len(rows) - 3)
+        of_delays = zip(logs[late] + late_prior, delays[late], off[late], strict=True)
+        turned_lately = float(np.ptp(yaws[0, self._is_recent]))
+        misturned = np.abs(FACTORS - 1) * turned_lately > HARMLESS_RAD
+        of_factors = zip(logs[wheels] + wheels_prior, FACTORS, misturned, strict=True)
         return [
             _Hypothesis('as it is', logs[0] + as_it_is, 0j, False),
             _Hypothesis('lever', logs[_LEVER] + prior, lever, abs(lever) > HARMLESS_M),
@@ -161,6 +175,7 @@ class _Window:
             _Hypothesis('scale', logs[_SCALE] + prior, scale, of_scale),
             _Hypothesis('unrelated', unrelated + prior, 0j, True),
             *(_Hypothesis('late', *each) for each in of_delays),
+            *(_Hypothesis('wheels', *each) for each in of_factors),
         ]
 
     def _paths(self) -> tuple[Complex, Array, Array]:
@@ -172,6 +187,13 @@ class _Window:
         at = self._seconds - delays[:, None]
         places, yaws = (np.interp(at, self._times, x) for x in (self._path, self._path_yaw))
         return places, yaws, delays
+
+    def _turned_paths(self, places: Complex, yaws: Array) -> tuple[Complex, Array]:
+        """Places and headings (R, N) on the path that turns FACTORS (R,) times as far."""
+        beyond = (FACTORS[:, None] - 1.0) * (yaws - yaws[0])
+        between = np.exp(1j * (beyond[:, 1:] + beyond[:, :-1]) / 2)
+        steps = np.cumsum(between * np.diff(places), axis=1)
+        return places[0] + np.insert(steps, 0, 0.0, axis=1), yaws + beyond
 
     def _fitted(self, rows: Complex, yaws: Array) -> tuple[Array, tuple[complex, float, float]]:
         """Log evidence (R,) of paths, and lever, angle and factor, which the last three have.

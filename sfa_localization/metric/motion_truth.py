@@ -52,6 +52,7 @@ WHEELS_STD = 0.05
 _SAMPLES, _STEP_S = 4000, 0.2
 _PRIOR_STD = np.array([1.0, 1.0, 1.0, 0.1])
 """Of theta: lever arm ahead and to the left, m, delay, s, and logarithm of the scale."""
+_SCALE: Mask = np.array([False, False, False, True])
 _STEP, _CLOSE, _ROUNDS = 0.05, 1e-4, 12  # of theta
 _UNITS = {1.0: '', 100.0: 'centimeters', 1000.0: 'millimeters'}
 
@@ -60,12 +61,14 @@ _UNITS = {1.0: '', 100.0: 'centimeters', 1000.0: 'millimeters'}
 class TruePoses:
     """Poses of base_link by a ground truth, and `sentences` on what was corrected.
 
-    Without `headings` the truth has none, and those of the odometry take their place.
+    Without `headings` the truth has none, and those of the odometry take their place. `offset` (3,)
+    was subtracted: m ahead and to the left of base_link, and the delay, s.
     """
 
     poses: Trajectory
     headings: bool = True
     sentences: tuple[str, ...] = ()
+    offset: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +124,10 @@ def _matched(
 class _Comparison:
     """Places of a truth, m, at N times in s, and the odometry of the drive."""
 
-    def __init__(self, truth: Trajectory, track: OdometryTrack) -> None:
+    def __init__(
+        self, truth: Trajectory, track: OdometryTrack, usual: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> None:
+        self.usual = np.array([*usual, 0.0])
         self.track, self.track_s, self.way = track, track.seconds, track.length
         self.wheels = track.poses[:, 0] + 1j * track.poses[:, 1]
         self.seconds = (truth.stamps_ns - track.stamps_ns[0]) * 1e-9
@@ -222,8 +228,13 @@ class _Comparison:
         return plain
 
     def settled(self, fit: _Fit, free: Mask) -> _Fit:
-        """The fit with a delay and a lever arm only where they matter, and each gains CERTAIN."""
+        """The fit with a delay and a lever arm only where they matter, and each gains CERTAIN, or
+        are the usual ones.
+        """
         rows, about_s, fits = np.arange(len(self.seconds)), float(fit.theta[2]), []
+        as_usual = self.fitted(fit.mirrored, self.usual, free & _SCALE, rows, self.usual[2])
+        if as_usual and self.usual.any():
+            fits.append((as_usual, 0.0))
         for lever, delay in product((True, False), repeat=2):
             chosen = free & [lever, lever, delay, True]
             other = self.fitted(fit.mirrored, fit.theta * chosen, chosen, rows, about_s)
@@ -310,14 +321,19 @@ class _Comparison:
 
 
 def true_poses(
-    truth: Trajectory, track: OdometryTrack, trusted: bool = True, open_loop: bool = False
+    truth: Trajectory,
+    track: OdometryTrack,
+    trusted: bool = True,
+    open_loop: bool = False,
+    usual: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> TruePoses:
     """The poses of base_link by a ground truth, which is compared with the odometry of the drive.
 
     Only odometry that is `trusted` refutes a truth. `open_loop` odometry repeats commands, which
-    the robot follows later: it shows no delay. Raises DataError for the truth of another drive.
+    the robot follows later: it shows no delay. The `usual` offset (3,) is that of other drives:
+    see TruePoses. Raises DataError for the truth of another drive.
     """
-    comparison = _Comparison(truth, track)
+    comparison = _Comparison(truth, track, usual)
     factor = comparison.scale()
     if factor < 1e-9 and trusted:
         raise DataError(f'{TRUTH} does not move with the robot: is its topic the right one?')
@@ -368,7 +384,7 @@ def _corrected(truth: Trajectory, comparison: _Comparison, fit: _Fit, unit: floa
     poses = np.column_stack([places.real, places.imag, wrap_angle(yaw)])
     stamps_ns = truth.stamps_ns - round(fit.theta[2] * 1e9)
     kept = Trajectory(stamps_ns[comparison.used], poses[comparison.used])
-    return TruePoses(kept, headings, tuple(sentences))
+    return TruePoses(kept, headings, tuple(sentences), tuple(fit.theta[:3].tolist()))
 
 
 def timed_points(
