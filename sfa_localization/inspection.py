@@ -306,7 +306,8 @@ class _Survey:
         # None without a topic: in damaged bags, '' can be the name of a topic.
         self._image = report.image_topic or None
         self._odometry = report.odometry_topic.partition(':')[0] or None
-        has_imu = topics.imu or any(topic.kind == decoding.IMU for topic in bag.topics.values())
+        recorded = [topic.kind for topic in bag.topics.values() if topic.count]
+        has_imu = topics.imu or decoding.IMU in recorded
         self._imu = (_topic_of(bag, 'imu', topics.imu, report) if has_imu else '') or None
         self._values: dict[str | None, list[tuple[int, Any]]] = {name: [] for name in bag.topics}
         self._gyro, self._frozen, self._repeats = VisualGyro(clockwise), FrozenWatch(), 0

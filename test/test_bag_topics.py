@@ -19,6 +19,7 @@ from sfa_localization.bags.satellite_fixes import east_north
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.writer import BagWriter, blank
 from sfa_localization.data.errors import BagError
+from sfa_localization.inspection import inspect
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 COUNT = 6
@@ -278,6 +279,7 @@ def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(tmp_path, capl
     run = read_drive(tmp_path / 'bag', tmp_path / 'cache')
     assert run.yaw_rate is None and len(run.panoramas) == 4
     assert 'no message on /imu: continuing without gyroscope' in caplog.text
+    assert not any('imu' in lack for lack in inspect(tmp_path / 'bag').lacks)
     with pytest.raises(BagError, match='/imu'):
         read_drive(tmp_path / 'bag', tmp_path, ReadingRecipe(topics=TopicNames(imu='/imu')))
 
