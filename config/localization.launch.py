@@ -17,7 +17,7 @@ from launch_ros.actions import Node, PushROSNamespace
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-from sfa_localization.nodes.entry import CANNOT_START
+from sfa_localization.nodes.process import CANNOT_START
 
 PACKAGE = 'sfa_localization'
 RESPAWN_DELAY_S = 2.0

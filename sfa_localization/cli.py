@@ -16,7 +16,7 @@ from pathlib import Path
 from sfa_localization import __version__
 from sfa_localization.data.errors import LocalizationError, NodeError
 from sfa_localization.nodes import entry
-from sfa_localization.nodes.entry import NODES
+from sfa_localization.nodes.process import NODES
 
 COMMANDS = {
     'simulate': 'Record a bag with a simulated robot in a simulated garden.',

@@ -27,7 +27,8 @@ from sfa_localization.data.plain_yaml import LONGEST, load_yaml
 from sfa_localization.data.rejections import quoted
 from sfa_localization.data.settings import Settings, nearest
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.mapping.settings import MetricConfig
+from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.nodes.settings import (
     EkfNodeConfig,
     NodeConfig,

@@ -49,12 +49,12 @@ from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.localizer import Localizer
-from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
-from sfa_localization.metric.motion_check import MotionCheck, check_motion
-from sfa_localization.metric.motion_clocks import Drift
-from sfa_localization.metric.motion_truth import TruePoses, true_poses
-from sfa_localization.metric.settings import SegmentConfig
-from sfa_localization.metric.turns import Headings, estimated
+from sfa_localization.motion.check import MotionCheck, check_motion
+from sfa_localization.motion.clocks import Drift
+from sfa_localization.motion.dead_reckoning import OdometryTrack, Way
+from sfa_localization.motion.settings import SegmentConfig
+from sfa_localization.motion.truth import TruePoses, true_poses
+from sfa_localization.motion.turns import Headings, estimated
 from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe

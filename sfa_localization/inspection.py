@@ -43,11 +43,11 @@ from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.keyframes.closures import STRETCH_M, Textures, driven
 from sfa_localization.keyframes.leveling import tilt_pairs
 from sfa_localization.keyframes.texture import channels, quantized, texture
-from sfa_localization.metric.drive_check import ROUTE, is_single_route
-from sfa_localization.metric.motion_check import MotionCheck, check_motion
-from sfa_localization.metric.motion_sources import IMAGES, POSE, late
+from sfa_localization.mapping.drive_check import ROUTE, is_single_route
 from sfa_localization.metric.points import stops
 from sfa_localization.metric.segments import PIECE_LENGTH_M
+from sfa_localization.motion.check import MotionCheck, check_motion
+from sfa_localization.motion.sources import IMAGES, POSE, late
 
 SAMPLES, SAMPLE_SIDE = 16, 640
 """Number of images on the contact sheet, and their longer side (pixels)."""

@@ -31,9 +31,9 @@ from sfa_localization.keyframes.location import Location, hypotheses, located
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE, Observation
 from sfa_localization.keyframes.regression import Fit
 from sfa_localization.keyframes.upright import UprightImage, upright
-from sfa_localization.metric.driven_ground import DrivenGround
-from sfa_localization.metric.saved_map import MetricMap
-from sfa_localization.metric.turned_maps import TurnedMaps
+from sfa_localization.mapping.driven_ground import DrivenGround
+from sfa_localization.mapping.saved_map import MetricMap
+from sfa_localization.mapping.turned_maps import TurnedMaps
 from sfa_localization.sfa.image_features import (
     TURNED_LAYER,
     Spectrum,

@@ -8,8 +8,8 @@
 4  slow features of all images (section 2.2)             sfa/image_features.py
 5  cut the odometry into segments (section 3.1)          metric/segments.py
 6  the certified drive, and the map of its features      metric/pose_graph.py, learning.py
-7  learn it again, from maps turned by its headings      metric/turned_maps.py
-8  keyframes, and the model for section 5                metric/keyframe_map.py, place_model.py
+7  learn it again, from maps turned by its headings      mapping/turned_maps.py
+8  keyframes, and the model for section 5                mapping/keyframe_map.py, place_model.py
 
 Steps 2 and 7 and the keyframes go beyond the paper; without closures, step 6 is its section 3.
 """
@@ -30,12 +30,12 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.fusion.motion import TURN_RADIUS_M
-from sfa_localization.metric.driven_ground import DrivenGround
-from sfa_localization.metric.drives import Maps, compare_with_map, learn_map, rig_of, with_points
-from sfa_localization.metric.keyframe_map import learn_keyframes
-from sfa_localization.metric.learning import MetricResult, learn_metric, with_turned
-from sfa_localization.metric.motion_check import MotionCheck
+from sfa_localization.mapping.driven_ground import DrivenGround
+from sfa_localization.mapping.drives import Maps, compare_with_map, learn_map, rig_of, with_points
+from sfa_localization.mapping.keyframe_map import learn_keyframes
+from sfa_localization.mapping.learning import MetricResult, learn_metric, with_turned
 from sfa_localization.metric.segments import Segments
+from sfa_localization.motion.check import MotionCheck
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.sfa.checkpoint import Checkpoint
 from sfa_localization.sfa.image_features import ImageFeatures, features_of_runs

@@ -33,14 +33,15 @@ from sfa_localization.keyframes.closures import Textures, find_closures, views_o
 from sfa_localization.keyframes.hidden import seen_in
 from sfa_localization.keyframes.leveling import camera_lean, leveled_runs, upright_run
 from sfa_localization.keyframes.texture import channels
-from sfa_localization.metric.dead_reckoning import OdometryTrack
-from sfa_localization.metric.drives import Drive, Drives
-from sfa_localization.metric.motion_check import MotionCheck, check_motion
-from sfa_localization.metric.motion_truth import timed_points
+from sfa_localization.mapping.drives import Drive, Drives
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.metric.mount import Mount
-from sfa_localization.metric.odometry_errors import same_scale
 from sfa_localization.metric.points import points_of
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.motion.check import MotionCheck, check_motion
+from sfa_localization.motion.dead_reckoning import OdometryTrack
+from sfa_localization.motion.odometry_errors import same_scale
+from sfa_localization.motion.settings import SegmentConfig
+from sfa_localization.motion.truth import timed_points
 from sfa_localization.sfa import mdp_engine
 from sfa_localization.sfa.checkpoint import Checkpoint
 from sfa_localization.sfa.network import Architecture, Network, standard_architecture

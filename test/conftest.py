@@ -86,7 +86,7 @@ _GARDENS = {}
 @pytest.fixture(scope='module')
 def small_network():
     """One layer for panoramas of 160x16, and few inducing points: training takes seconds."""
-    from sfa_localization.metric import selection
+    from sfa_localization.mapping import selection
     from sfa_localization.sfa import network
 
     layer = network.Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)

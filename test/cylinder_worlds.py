@@ -18,7 +18,7 @@ from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.light import Conditions
 from sfa_localization.keyframes.location import hypotheses, located
 from sfa_localization.keyframes.upright import upright
-from sfa_localization.metric.settings import MetricConfig
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.sfa.network import Architecture, Layer
 from sfa_localization.sfa.network_training import ImageSequence, train_network
 from sfa_localization.sfa.settings import NetworkConfig

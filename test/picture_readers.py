@@ -16,7 +16,7 @@ from sfa_localization.data.rig import Rig
 from sfa_localization.keyframes.location import Location
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE, Observation
 from sfa_localization.keyframes.regression import Fit
-from sfa_localization.metric.driven_ground import DrivenGround
+from sfa_localization.mapping.driven_ground import DrivenGround
 
 SIZE = PanoramaConfig(width=64, height=16)
 STEP_M = 0.05

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.metric.basis import (
+from sfa_localization.mapping.basis import (
     Monomials,
     Process,
     expand,
@@ -14,7 +14,7 @@ from sfa_localization.metric.basis import (
     missing,
     monomials,
 )
-from sfa_localization.metric.saved_map import MetricMap
+from sfa_localization.mapping.saved_map import MetricMap
 
 RNG = np.random.default_rng(0)
 FEATURES = RNG.standard_normal((80, 6))

@@ -10,10 +10,10 @@ import pytest
 from sfa_localization.data.geometry import compose
 from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate
 from sfa_localization.keyframes.closures import STRETCH_M, Closures, driven
-from sfa_localization.metric.breaks import contradicted, parted
-from sfa_localization.metric.motion_check import check_motion
-from sfa_localization.metric.motion_sources import compare_map
-from sfa_localization.metric.odometry_errors import same_scale
+from sfa_localization.motion.breaks import contradicted, parted
+from sfa_localization.motion.check import check_motion
+from sfa_localization.motion.odometry_errors import same_scale
+from sfa_localization.motion.sources import compare_map
 
 STAMPS = 10**9 + np.arange(751) * 40_000_000
 """Odometry at 25 Hz for 30 s; images every 0.2 s."""

@@ -16,16 +16,17 @@ from sfa_localization.data.run import PanoramaArray
 from sfa_localization.keyframes.closures import STRETCH_M, Closures, Textures, find_closures
 from sfa_localization.keyframes.offsets import find_offsets
 from sfa_localization.keyframes.texture import quantized, texture
-from sfa_localization.metric import selection
-from sfa_localization.metric.basis import Process
-from sfa_localization.metric.learning import learn_metric
+from sfa_localization.mapping import selection
+from sfa_localization.mapping.basis import Process
+from sfa_localization.mapping.learning import learn_metric
+from sfa_localization.mapping.map_fit import MetricProblem
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.loops import with_closures
-from sfa_localization.metric.map_fit import MetricProblem
 from sfa_localization.metric.pose_graph import Graph, cost, form_of, graph_poses, proof, refined
 from sfa_localization.metric.segments import cut, join
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import SegmentPoses, Stack, tracks
+from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.sfa.zero_time_edges import edges_between
 
 CONFIG = PanoramaConfig(width=120, height=24)

@@ -28,7 +28,7 @@ from study.__main__ import study_parser
 from sfa_localization import __version__, cli
 from sfa_localization.bags.reader import Bag
 from sfa_localization.data.settings import Settings
-from sfa_localization.nodes.entry import CANNOT_START, DIED
+from sfa_localization.nodes.process import CANNOT_START, DIED
 from sfa_localization.nodes.settings import EkfNodeConfig
 from sfa_localization.place_model import PlaceModel
 

@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from sfa_localization.cli import main
-from sfa_localization.metric.driven_ground import DrivenGround
-from sfa_localization.metric.settings import GroundConfig
+from sfa_localization.mapping.driven_ground import DrivenGround
+from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.place_model import PlaceModel
 
 PLACES = np.array([[0.0, 0.0], [0.8, 0.0], [0.8, 0.8], [4.0, 0.8], [4.0, 1.6]])

@@ -23,7 +23,7 @@ from sfa_localization.fusion import pose_filter
 from sfa_localization.fusion.belief import DrivenPath
 from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.fusion.health import health_of
-from sfa_localization.metric.motion_truth import TruePoses
+from sfa_localization.motion.truth import TruePoses
 from sfa_localization.place_model import PlaceModel
 
 

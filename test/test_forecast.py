@@ -12,13 +12,14 @@ from scipy.ndimage import gaussian_filter1d
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align, rotation
-from sfa_localization.metric import drive_check, selection
-from sfa_localization.metric.forecast import REACH_M
-from sfa_localization.metric.learning import learn_metric
+from sfa_localization.mapping import drive_check, selection
+from sfa_localization.mapping.forecast import REACH_M
+from sfa_localization.mapping.learning import learn_metric
+from sfa_localization.mapping.selection import folds
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.metric.segments import cut
-from sfa_localization.metric.selection import folds
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Stack
+from sfa_localization.motion.settings import SegmentConfig
 
 CONFIG = MetricConfig(slow_features=12)
 DRIVES = {

@@ -27,7 +27,7 @@ from sfa_localization.inspection import (
     lacks_of_drives,
     path_length,
 )
-from sfa_localization.metric.drive_check import ROUTE
+from sfa_localization.mapping.drive_check import ROUTE
 
 START = 1_700_000_000_000_000_000
 STEP = 200_000_000

@@ -30,12 +30,13 @@ from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.localizer import Localizer
-from sfa_localization.metric.drives import Drive, Drives, learn_map, with_points
-from sfa_localization.metric.learning import learn_metric
+from sfa_localization.mapping.drives import Drive, Drives, learn_map, with_points
+from sfa_localization.mapping.learning import learn_metric
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.metric.measured_points import MeasuredPoints, Settled, settle
 from sfa_localization.metric.points import points_of, read_points, stops
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Stack
+from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.summary import summary
 from sfa_localization.reports.training import write_training_report

@@ -22,15 +22,17 @@ from metric_worlds import (
 
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import RigidTransform, align, compose, invert, wrap_angle
-from sfa_localization.metric import paper_solver, pose_graph, selection
-from sfa_localization.metric.basis import monomials
-from sfa_localization.metric.learning import learn_metric
-from sfa_localization.metric.map_fit import MetricProblem
-from sfa_localization.metric.paper_solver import Lines, mirrored, odometry_start
+from sfa_localization.mapping import paper_solver, selection
+from sfa_localization.mapping.basis import monomials
+from sfa_localization.mapping.learning import learn_metric
+from sfa_localization.mapping.map_fit import MetricProblem
+from sfa_localization.mapping.paper_solver import Lines, mirrored, odometry_start
+from sfa_localization.mapping.settings import MetricConfig
+from sfa_localization.metric import pose_graph
 from sfa_localization.metric.pose_graph import Certificate
 from sfa_localization.metric.segments import assignment, cut, join
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Stack
+from sfa_localization.motion.settings import SegmentConfig
 
 ANY = SegmentConfig()
 STRAIGHT = SegmentConfig(segments='straight')

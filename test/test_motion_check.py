@@ -29,17 +29,17 @@ from sfa_localization.data.run import (
     integrate,
 )
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
-from sfa_localization.metric.breaks import parted
-from sfa_localization.metric.dead_reckoning import OdometryTrack
-from sfa_localization.metric.motion_check import check_motion
-from sfa_localization.metric.motion_sources import (
+from sfa_localization.motion.breaks import parted
+from sfa_localization.motion.check import check_motion
+from sfa_localization.motion.dead_reckoning import OdometryTrack
+from sfa_localization.motion.settings import SegmentConfig
+from sfa_localization.motion.sources import (
     IMAGES,
     POSE,
     TWIST,
     compare_map,
 )
-from sfa_localization.metric.motion_truth import TruePoses, timed_points, true_poses
-from sfa_localization.metric.settings import SegmentConfig
+from sfa_localization.motion.truth import TruePoses, timed_points, true_poses
 from sfa_localization.training import train
 from sfa_localization.training_input import Recipe, compared
 

@@ -25,12 +25,13 @@ from sfa_localization.keyframes.closures import Textures
 from sfa_localization.keyframes.hidden import seen_in
 from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.keyframes.turning import lever_square
-from sfa_localization.metric.dead_reckoning import OdometryTrack
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.pose_graph import Graph, graph_poses
 from sfa_localization.metric.segments import cut_track, join
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Stack
+from sfa_localization.motion.dead_reckoning import OdometryTrack
+from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.training_input import Recipe, TrainingInput
 
 CONFIG = SegmentConfig()

@@ -21,7 +21,7 @@ from rcl_interfaces.srv import SetParameters
 from ros_bench import DEADLINE_S, start_process, until
 from rosgraph_msgs.msg import Clock
 
-from sfa_localization.nodes.entry import CANNOT_START, DIED
+from sfa_localization.nodes.process import CANNOT_START, DIED
 
 pytestmark = pytest.mark.ros
 IMPORT = 'import sys; from sfa_localization.nodes import entry'

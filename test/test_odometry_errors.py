@@ -11,13 +11,13 @@ from cylinder_worlds import SMALL_RECIPE, Spheres, run_in, wander
 from sfa_localization.data.geometry import align
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import Odometry, integrate
-from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
-from sfa_localization.metric.odometry_errors import (
+from sfa_localization.motion.dead_reckoning import OdometryTrack, Way
+from sfa_localization.motion.odometry_errors import (
     LARGEST_LOSS,
     PAIRS_MIN,
     way_of,
 )
-from sfa_localization.metric.settings import SegmentConfig
+from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.reports.summary import summary
 from sfa_localization.sfa.network_training import ImageSequence, train_network
 from sfa_localization.training import learn_place

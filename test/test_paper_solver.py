@@ -9,12 +9,13 @@ import pytest
 from metric_worlds import criss_cross, drive, exact_features
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.metric.basis import monomials
-from sfa_localization.metric.map_fit import MetricProblem
-from sfa_localization.metric.paper_solver import Lines, descend, learn, odometry_start
+from sfa_localization.mapping.basis import monomials
+from sfa_localization.mapping.map_fit import MetricProblem
+from sfa_localization.mapping.paper_solver import Lines, descend, learn, odometry_start
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.metric.segments import cut
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Stack
+from sfa_localization.motion.settings import SegmentConfig
 
 
 def problem():

@@ -13,7 +13,7 @@ from sfa_localization.data.geometry import compose, relative, wrap_angle
 from sfa_localization.data.run import Odometry, YawRate
 from sfa_localization.metric import segments as segments_module
 from sfa_localization.metric.segments import PIECE_LENGTH_M, cut
-from sfa_localization.metric.settings import SegmentConfig
+from sfa_localization.motion.settings import SegmentConfig
 
 ANY = SegmentConfig()
 STRAIGHT = SegmentConfig(segments='straight')

@@ -14,7 +14,7 @@ from sfa_localization.camera.watch import EXPLAINED_WARNING, FROZEN_IMAGES
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.camera_clock import NEAR_NS
-from sfa_localization.metric.settings import GroundConfig
+from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.observer import UNKNOWN_VARIANCE
 from sfa_localization.place_model import PlaceModel
 

@@ -25,8 +25,8 @@ from cylinder_worlds import (
 from sfa_localization import training
 from sfa_localization.data.errors import DataError, LocalizationError, ModelError
 from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run, integrate
-from sfa_localization.metric import learning
-from sfa_localization.metric.drive_check import ROUTE
+from sfa_localization.mapping import learning
+from sfa_localization.mapping.drive_check import ROUTE
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.summary import summary
 from sfa_localization.sfa import checkpoint as checkpoints

@@ -12,11 +12,12 @@ import pytest
 from scipy.stats import chi2
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.metric import learning, selection
-from sfa_localization.metric.learning import MetricResult, learn_turned
+from sfa_localization.mapping import learning, selection
+from sfa_localization.mapping.learning import MetricResult, learn_turned
+from sfa_localization.mapping.settings import MetricConfig
+from sfa_localization.mapping.turned_maps import TurnedMaps, turned_back
 from sfa_localization.metric.segments import cut
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
-from sfa_localization.metric.turned_maps import TurnedMaps, turned_back
+from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.sfa.image_features import spectrum
 
 COLUMNS, CHANNELS, ORDERS = 24, 6, 5

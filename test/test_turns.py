@@ -12,10 +12,10 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, integrate
 from sfa_localization.keyframes.closures import Closures
-from sfa_localization.metric.dead_reckoning import BRIDGE_MAX_S, OdometryTrack
-from sfa_localization.metric.drives import rig_of
-from sfa_localization.metric.settings import SegmentConfig
-from sfa_localization.metric.turns import Headings, estimated
+from sfa_localization.mapping.drives import rig_of
+from sfa_localization.motion.dead_reckoning import BRIDGE_MAX_S, OdometryTrack
+from sfa_localization.motion.settings import SegmentConfig
+from sfa_localization.motion.turns import Headings, estimated
 from sfa_localization.training_input import TrainingInput
 
 CONFIG = SegmentConfig()

@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import rclpy
 from builtin_interfaces.msg import Time
@@ -29,11 +29,9 @@ from rosgraph_msgs.msg import Clock
 
 from sfa_localization.bags.decoding import IMAGES, ODOMETRY
 from sfa_localization.bags.reader import Bag
+from sfa_localization.commands.settings import PlayConfig
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.rejections import encodable
-
-if TYPE_CHECKING:
-    from sfa_localization.commands.play import PlayConfig
 
 DEPTH, LATCHED_DEPTH = 10, 100
 """Messages in the queue of a publisher, and in the queue that late subscribers receive."""

@@ -20,7 +20,7 @@ from sfa_localization.commands import evaluate, inspect, train
 from sfa_localization.data.errors import BagError, LocalizationError, ModelError
 from sfa_localization.data.files import read_text, write_json
 from sfa_localization.data.plain_yaml import LONGEST
-from sfa_localization.metric.settings import GroundConfig
+from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.fleet import STATES
 from sfa_localization.reports.page import BAD, WEAK

@@ -11,7 +11,7 @@ import numpy as np
 
 from sfa_localization.commands import options
 from sfa_localization.data.files import atomic_write
-from sfa_localization.metric.settings import GroundConfig
+from sfa_localization.mapping.settings import GroundConfig
 
 WRITES = 'MAP.yaml and MAP.pgm, which nav2_map_server reads'
 EXAMPLES = """\

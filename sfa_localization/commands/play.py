@@ -5,25 +5,16 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
 from pathlib import Path
 
 from sfa_localization.commands import options
-from sfa_localization.data.settings import Settings, setting
+from sfa_localization.commands.settings import PlayConfig
 
 WRITES = 'no file: it publishes'
 EXAMPLES = """\
   play bags/sample
   play bags/sample --rate 2 --loop --clock
   play bags/sample --topics /panorama/compressed /odom"""
-
-
-@dataclass(frozen=True, slots=True)
-class PlayConfig(Settings):
-    """How a bag is replayed."""
-
-    rate: float = setting(1.0, 'speed of the replay', unit='x', low=1e-3, high=1e6)
-    wait: float = setting(20.0, 'longest wait for subscribers', unit='s', low=0.0, high=3600.0)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -14,7 +14,8 @@ from sfa_localization.commands import options
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.files import first_bytes, write_json
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.mapping.settings import MetricConfig
+from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.sfa.settings import NetworkConfig
 
 if TYPE_CHECKING:

@@ -25,9 +25,9 @@ from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.data.statistics import LENGTH_TO_STD, MEDIAN_TO_STD, outlier_factor
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.keyframes.offsets import Offsets
-from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.stack import SegmentPoses, Stack
+from sfa_localization.motion.dead_reckoning import summed
 
 # Standard deviations, rad and m per axis, which grow with `Offsets.unlike`, that of closures, and
 # the least factor on them.

@@ -18,10 +18,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from scipy import linalg, sparse
+from scipy import linalg
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import (
@@ -35,10 +35,6 @@ from sfa_localization.data.geometry import (
 )
 from sfa_localization.data.messages import LARGEST_SCALE
 from sfa_localization.data.run import Odometry, Points, Stamps
-
-if TYPE_CHECKING:
-    from sfa_localization.metric.stack import SegmentPoses, Stack
-
 
 WHEELS_STD = 0.02
 """Prior of the scale of wheels: in drives of real robots they count up to 2 % wrong."""
@@ -114,29 +110,6 @@ class MeasuredPoints:
     def placed(self) -> Mask:
         """(K,) of the points near an image."""
         return self.images >= 0
-
-    def rows(self, stack: Stack) -> Complex:
-        """Rows (K, 3N) whose products with [o, z, -b z] are where the drive puts the robot; 0 for
-        points near no image."""
-        rows, placed = stack.rows(self.images), self.placed.astype(float)
-        beside = stack.facing_rows(rows, placed * self.offset)
-        return np.asarray((stack.place_rows(rows, placed) + beside).toarray())
-
-    def ties(self, stack: Stack, before: SegmentPoses | None = None) -> sparse.csr_array:
-        """Rows (K, 3N) of the residuals of the used points over their standard deviations.
-
-        The heading of the points turns with the mean of the segments from that at the poses
-        `before`, without which there are no rows.
-        """
-        n, used = stack.segments, self.settled.used & self.settled.turned
-        if before is None or not used.any():
-            return sparse.csr_array((0, 3 * n), dtype=complex)
-        rows, points, std = self.rows(stack)[used], self.points.places[used], self.points.std[used]
-        points = points - points.mean()
-        turn, _ = align_complex(points, rows @ before.coefficients(stack.period), std**-2)
-        rows[:, n : 2 * n] -= np.outer(turn * points, before.z.conj() / n)
-        rows = (rows - np.average(rows, axis=0, weights=std**-2)) / std[:, None]
-        return sparse.csr_array(rows)
 
     def frame(self, places: Complex, start: RigidTransform) -> RigidTransform:
         """The transform from places (K,) to the used points; `start` without any, and with its

@@ -24,6 +24,7 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
 from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.data.statistics import evenly
+from sfa_localization.metric import point_ties
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.loops import Loops
 from sfa_localization.metric.mount import Mount
@@ -78,7 +79,11 @@ class Graph:
             links = graph.learned(stated, links) if graph else stated
             before = graph.poses if graph else None
             rows = sparse.vstack([links.ties(stack), loops.ties(stack, before)])
-            tied = [rows, segments.points.ties(stack, before)] if segments.points else [rows]
+            tied = (
+                [rows, point_ties.ties(segments.points, stack, before)]
+                if segments.points
+                else [rows]
+            )
             form = form_of(sparse.vstack(tied), stack)
             graph = cls.solved(form, stack, before)
             # Expected information: in the observed one, outliers count.

@@ -21,10 +21,10 @@ from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_a
 from sfa_localization.data.run import Count, Odometry, Stamps, Trajectory, YawRate
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.keyframes.offsets import Offsets
-from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack, Way, summed
 from sfa_localization.metric.measured_points import MeasuredPoints
 from sfa_localization.metric.mount import Mount
-from sfa_localization.metric.settings import SegmentConfig
+from sfa_localization.motion.dead_reckoning import TURN_SLIDE, OdometryTrack, Way, summed
+from sfa_localization.motion.settings import SegmentConfig
 
 PIECE_LENGTH_M = 3.0
 """Longest piece of any drive: long enough for several images, short enough to be rigid."""

@@ -33,7 +33,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import NANOSECONDS, read_stamp, require_sane
 from sfa_localization.data.rig import Rig
 from sfa_localization.data.run import Image
-from sfa_localization.metric.driven_ground import Cells, DrivenGround
+from sfa_localization.mapping.driven_ground import Cells, DrivenGround
 
 _FIXED = np.diag([1e-6] * 6)
 """Covariance of z, roll and pitch, which a planar estimate fixes."""

@@ -8,8 +8,8 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sfa_localization.nodes.entry import NODES
 from sfa_localization.nodes.monitor import steady_s
+from sfa_localization.nodes.process import NODES
 
 PATIENCE_S = 3.0
 """Time before another topic is taken: drivers of cameras and wheels may start after this node."""

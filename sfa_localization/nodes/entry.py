@@ -16,14 +16,7 @@ import textwrap
 from collections.abc import Sequence
 from functools import partial
 
-NODES = {
-    'omnicam_node': 'ROS 2 node: camera images to panoramas (--ros-args -p NAME:=VALUE).',
-    'sfa_node': 'ROS 2 node: panoramas to slow features and poses.',
-    'ekf_node': 'ROS 2 node: poses and odometry to the pose in the map.',
-}
-CANNOT_START, DIED = 1, 2
-"""Exit codes: a launch ends if a node cannot start, and restarts a node that died."""
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+from sfa_localization.nodes.process import NODES, SIGNALS
 
 
 def run(name: str, words: Sequence[str] | None = None) -> int:

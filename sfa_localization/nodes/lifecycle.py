@@ -31,9 +31,10 @@ from sfa_localization.data.errors import ConfigError, LocalizationError
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.settings import Settings
 from sfa_localization.data.threads import one_core
-from sfa_localization.nodes import entry, parameters
+from sfa_localization.nodes import parameters
 from sfa_localization.nodes.discovery import PATIENCE_S
 from sfa_localization.nodes.monitor import Monitor, steady_s
+from sfa_localization.nodes.process import CANNOT_START, DIED, SIGNALS
 from sfa_localization.nodes.settings import NodeConfig
 
 _PACKAGE = 'sfa_localization'
@@ -331,14 +332,14 @@ def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
         parameters.warn_of_arguments(node, words)
         node.find_files(words)
         if not node.start():
-            return entry.CANNOT_START if rclpy.ok() else 0
+            return CANNOT_START if rclpy.ok() else 0
         executor.add_node(node)
         with one_core():
             _spin(executor, node)
     except Exception as error:
         if rclpy.ok() or isinstance(error, LocalizationError):  # else a signal is the cause
             rclpy.logging.get_logger(_PACKAGE).fatal(_reason(error))
-            return entry.DIED if node is not None and node.active else entry.CANNOT_START
+            return DIED if node is not None and node.active else CANNOT_START
     finally:
         if node is not None:
             node.attempt('cleanup', node.teardown)
@@ -354,7 +355,7 @@ def _initialize(words: list[str]) -> None:
     except RuntimeError as error:  # some of rclpy's texts are a list of arguments
         raise ConfigError(f'ROS cannot use its arguments: {error}') from None
     # rclpy's handlers call those before them, and restore them when ROS ends.
-    for number in entry.SIGNALS:
+    for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     install_signal_handlers(SignalHandlerOptions.ALL)
     others = ' '.join(rclpy.utilities.remove_ros_args(words)[1:])

@@ -29,7 +29,7 @@ from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.camera_clock import NEAR_NS
-from sfa_localization.metric.settings import GroundConfig
+from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.discovery import Discovery
 from sfa_localization.nodes.image_input import ImageInput

@@ -9,7 +9,7 @@ from typing import Any
 
 from sfa_localization.camera.lens_report import sentence
 from sfa_localization.inspection import InspectionConfig, too_sparse
-from sfa_localization.metric.motion_sources import MAP
+from sfa_localization.motion.sources import MAP
 from sfa_localization.training import Trained
 
 GOOD, WEAK, BAD = 'good', 'weak', 'bad'

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.inspection import InspectionConfig, covered_share, sparse_lanes
-from sfa_localization.metric.forecast import Forecast
+from sfa_localization.mapping.forecast import Forecast
 from sfa_localization.reports import figures, page
 from sfa_localization.reports.bag import motion_section
 from sfa_localization.reports.evaluation import firing_maps_figure

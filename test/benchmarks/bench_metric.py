@@ -22,11 +22,12 @@ from metric_worlds import DriveWithTruth, criss_cross, drive, garden_features, g
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align
-from sfa_localization.metric.basis import Monomials
-from sfa_localization.metric.drive_check import check, diagnose
-from sfa_localization.metric.map_fit import MapFit, MetricProblem
+from sfa_localization.mapping.basis import Monomials
+from sfa_localization.mapping.drive_check import check, diagnose
+from sfa_localization.mapping.map_fit import MapFit, MetricProblem
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.metric.segments import Segments, cut
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.motion.settings import SegmentConfig
 
 NOISE = {'bias': 1e-3, 'yaw_noise': 0.01, 'speed_noise': 0.03}
 # The paper's eight features and no ridge; the yaw-rate bias has no place in its costs.

@@ -20,7 +20,7 @@ from page_tables import markdown
 from sfa_localization import __version__
 from sfa_localization.data.geometry import RigidTransform
 from sfa_localization.evaluation import evaluate
-from sfa_localization.metric.settings import MetricConfig
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.figures import save_text
 from sfa_localization.training import Recipe, train

@@ -22,8 +22,9 @@ from sfa_localization.keyframes.light import Conditions
 from sfa_localization.keyframes.location import Location
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE
 from sfa_localization.keyframes.regression import Fit
-from sfa_localization.metric.learning import MetricResult, learn_metric
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.mapping.learning import MetricResult, learn_metric
+from sfa_localization.mapping.settings import MetricConfig
+from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.observer import UNKNOWN_VARIANCE
 from sfa_localization.place_model import PlaceModel, View
 from sfa_localization.sfa.network import standard_architecture

@@ -18,8 +18,8 @@ from sfa_localization.data.geometry import Array, RigidTransform
 from sfa_localization.data.run import Run, Trajectory
 from sfa_localization.evaluation import evaluate, fit_transform, moved, score
 from sfa_localization.keyframes.closures import Closures
-from sfa_localization.metric.drives import Drives
-from sfa_localization.metric.learning import learn_metric
+from sfa_localization.mapping.drives import Drives
+from sfa_localization.mapping.learning import learn_metric
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.figures import save_text
 from sfa_localization.training import Recipe

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from sfa_localization.data.geometry import RigidTransform
 from sfa_localization.evaluation import evaluate
-from sfa_localization.metric.settings import GroundConfig
+from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.nodes.conversions import to_grid, to_lines
 from sfa_localization.place_model import PlaceModel
 

@@ -19,12 +19,13 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, RigidTransform, align
 from sfa_localization.data.run import Trajectory
 from sfa_localization.evaluation import evaluate, odometry_from_start
-from sfa_localization.metric.basis import PAPER_FEATURES, monomials
-from sfa_localization.metric.learning import MetricResult, learn_metric
-from sfa_localization.metric.paper_solver import Lines, descend
+from sfa_localization.mapping.basis import PAPER_FEATURES, monomials
+from sfa_localization.mapping.learning import MetricResult, learn_metric
+from sfa_localization.mapping.paper_solver import Lines, descend
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.metric.segments import Segments, assignment
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Stack
+from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.evaluation import firing_maps_figure
 from study import paper_report as report

@@ -19,7 +19,7 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.evaluation import evaluate
-from sfa_localization.metric.settings import MetricConfig
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.simulation.drive import SimulatedDrive, drive, record
 from sfa_localization.simulation.garden import Garden
 from sfa_localization.training import Recipe

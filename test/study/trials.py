@@ -27,11 +27,12 @@ from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.keyframes.light import Conditions
-from sfa_localization.metric.basis import PAPER_FEATURES, Basis, expand
-from sfa_localization.metric.drives import Drive, Drives
-from sfa_localization.metric.saved_map import MetricMap
+from sfa_localization.mapping.basis import PAPER_FEATURES, Basis, expand
+from sfa_localization.mapping.drives import Drive, Drives
+from sfa_localization.mapping.saved_map import MetricMap
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.metric.segments import Segments, join
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.sfa.image_features import slow_features
 from sfa_localization.sfa.network import Network

@@ -17,8 +17,8 @@ from sfa_localization.keyframes.closures import Textures
 from sfa_localization.keyframes.errors import ErrorModel, LeftOut
 from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.training import choose_keyframes, located_without
-from sfa_localization.metric.forecast import ground_distances, importance
-from sfa_localization.metric.learning import MetricResult
+from sfa_localization.mapping.forecast import ground_distances, importance
+from sfa_localization.mapping.learning import MetricResult
 from sfa_localization.metric.segments import Segments, assignment
 from sfa_localization.metric.stack import Stack, tracks
 

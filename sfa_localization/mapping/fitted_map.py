@@ -19,10 +19,11 @@ from sfa_localization.data.geometry import (
     invert,
 )
 from sfa_localization.data.statistics import evenly
-from sfa_localization.metric.dead_reckoning import summed
-from sfa_localization.metric.map_fit import MapFit
+from sfa_localization.mapping.map_fit import MapFit
+from sfa_localization.mapping.saved_map import MetricMap
+from sfa_localization.metric import point_ties
 from sfa_localization.metric.pose_graph import SAMPLED
-from sfa_localization.metric.saved_map import MetricMap
+from sfa_localization.motion.dead_reckoning import summed
 
 
 def plane(points: Complex) -> Array:
@@ -48,7 +49,7 @@ def places_of_points(fit: MapFit) -> tuple[Complex, Complex]:
     measured = fit.problem.segments.points
     if measured is None:
         return np.zeros(0, complex), np.zeros((0, 0), complex)
-    rows = measured.rows(fit.stack)
+    rows = point_ties.rows(measured, fit.stack)
     return rows @ fit.graph.poses.coefficients(fit.stack.period), fit.graph.covariance(rows)
 
 

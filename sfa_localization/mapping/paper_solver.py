@@ -14,10 +14,10 @@ import numpy as np
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices
-from sfa_localization.metric.basis import PAPER_FEATURES, Monomials, monomials
-from sfa_localization.metric.map_fit import MapFit, MetricProblem, residual_variance
+from sfa_localization.mapping.basis import PAPER_FEATURES, Monomials, monomials
+from sfa_localization.mapping.map_fit import MapFit, MetricProblem, residual_variance
+from sfa_localization.mapping.ridge import Ridge
 from sfa_localization.metric.pose_graph import Graph, form_of, refined
-from sfa_localization.metric.ridge import Ridge
 from sfa_localization.metric.stack import SegmentPoses
 
 ITERATIONS = 1000

@@ -20,7 +20,7 @@ from sfa_localization.data.odometry_steps import JUMP, beyond, tolerance
 from sfa_localization.data.run import Odometry, Stamps, chained
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
 from sfa_localization.keyframes.closures import LIKE
-from sfa_localization.metric.dead_reckoning import pauses, spaced, summed
+from sfa_localization.motion.dead_reckoning import pauses, spaced, summed
 
 StampedTextures = tuple[Stamps, NDArray[np.int8]]
 """Stamps (N,) of images, and small versions of these (N, rows, columns), of zero mean around the

@@ -25,23 +25,23 @@ from sfa_localization.data.geometry import (
     wrap_angle,
 )
 from sfa_localization.data.statistics import evenly
-from sfa_localization.metric import paper_solver
-from sfa_localization.metric.drive_check import Diagnostics, check, check_amount, diagnose
-from sfa_localization.metric.fitted_map import (
+from sfa_localization.mapping import paper_solver
+from sfa_localization.mapping.drive_check import Diagnostics, check, check_amount, diagnose
+from sfa_localization.mapping.fitted_map import (
     map_frame,
     metric_map,
     places_of_points,
     plane,
 )
-from sfa_localization.metric.forecast import Forecast
-from sfa_localization.metric.map_fit import MapFit, MetricProblem
+from sfa_localization.mapping.forecast import Forecast
+from sfa_localization.mapping.map_fit import MapFit, MetricProblem
+from sfa_localization.mapping.saved_map import MetricMap
+from sfa_localization.mapping.selection import HeldOut, choose, hold_out
+from sfa_localization.mapping.settings import MetricConfig
+from sfa_localization.mapping.turned_maps import TurnedMaps
 from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.pose_graph import Certificate, Graph
-from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.selection import HeldOut, choose, hold_out
-from sfa_localization.metric.settings import MetricConfig
-from sfa_localization.metric.turned_maps import TurnedMaps
 from sfa_localization.sfa.image_features import Spectrum
 
 logger = logging.getLogger(__name__)

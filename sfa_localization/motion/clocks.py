@@ -14,7 +14,7 @@ from scipy.stats import linregress, theilslopes
 from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.run import Stamps
 from sfa_localization.data.statistics import MEDIAN_TO_STD, parabola_peak
-from sfa_localization.metric.motion_sources import (
+from sfa_localization.motion.sources import (
     ALIKE,
     EQUAL,
     FAR,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.saved_map import MetricMap
+from sfa_localization.mapping.saved_map import MetricMap
 from sfa_localization.sfa.image_features import Spectrum
 
 Vectors = NDArray[np.float32]

@@ -14,12 +14,12 @@ import numpy as np
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices, align_complex
 from sfa_localization.data.statistics import needed_factor
-from sfa_localization.metric.basis import PAPER_FEATURES, Basis, Monomials, Process, spread
-from sfa_localization.metric.fitted_map import place_variance, plane
-from sfa_localization.metric.forecast import Forecast, ground_distances, importance, nearest_used
-from sfa_localization.metric.map_fit import MapFit, MetricProblem
+from sfa_localization.mapping.basis import PAPER_FEATURES, Basis, Monomials, Process, spread
+from sfa_localization.mapping.fitted_map import place_variance, plane
+from sfa_localization.mapping.forecast import Forecast, ground_distances, importance, nearest_used
+from sfa_localization.mapping.map_fit import MapFit, MetricProblem
+from sfa_localization.mapping.ridge import Ridge
 from sfa_localization.metric.pose_graph import cost, refined
-from sfa_localization.metric.ridge import Ridge
 from sfa_localization.metric.stack import Stack
 
 INDUCING_POINTS = 1000

@@ -20,7 +20,7 @@ import numpy as np
 from sfa_localization.data.array_files import Arrays, packed, unpacked
 from sfa_localization.data.errors import DataError, ModelError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.basis import Basis, basis_from
+from sfa_localization.mapping.basis import Basis, basis_from
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,10 +20,10 @@ from sfa_localization.data.geometry import Array, Complex, Indices, relative, wr
 from sfa_localization.data.odometry_steps import JUMP, NOISE
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
-from sfa_localization.metric.breaks import StampedTextures, contradicted, parted
-from sfa_localization.metric.motion_clocks import Drift, drift_sentences, drifts, following
-from sfa_localization.metric.motion_gyro import cleaned
-from sfa_localization.metric.motion_sources import (
+from sfa_localization.motion.breaks import StampedTextures, contradicted, parted
+from sfa_localization.motion.clocks import Drift, drift_sentences, drifts, following
+from sfa_localization.motion.gyro import cleaned
+from sfa_localization.motion.sources import (
     CERTAIN,
     ENOUGH,
     EQUAL,

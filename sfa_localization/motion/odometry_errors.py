@@ -23,7 +23,7 @@ from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Run, Stamps
 from sfa_localization.data.statistics import MEDIAN_TO_STD, evenly, outlier_factor
 from sfa_localization.keyframes.closures import Closures, driven
-from sfa_localization.metric.dead_reckoning import OdometryTrack, Way, spaced, summed
+from sfa_localization.motion.dead_reckoning import OdometryTrack, Way, spaced, summed
 
 CLOSURES_MIN = 30
 """Fewer closures do not show the scale of two drives."""

@@ -20,12 +20,12 @@ import numpy as np
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices
-from sfa_localization.metric.basis import Basis
+from sfa_localization.mapping.basis import Basis
+from sfa_localization.mapping.ridge import Ridge
+from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.pose_graph import Graph, form_of, refined
-from sfa_localization.metric.ridge import Ridge
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.settings import MetricConfig
 from sfa_localization.metric.stack import SegmentPoses, Stack
 
 LINK_WEIGHT = 2.0

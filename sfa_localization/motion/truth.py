@@ -28,9 +28,9 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_angle
 from sfa_localization.data.run import Points, Stamps, Trajectory
 from sfa_localization.data.statistics import LENGTH_TO_STD, evenly, outlier_factor, surprise
-from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack
-from sfa_localization.metric.motion_samples import OUTLIER, fault_sentence, faulty
-from sfa_localization.metric.motion_sources import ALIKE, EQUAL, LATE_S, late
+from sfa_localization.motion.dead_reckoning import TURN_SLIDE, OdometryTrack
+from sfa_localization.motion.samples import OUTLIER, fault_sentence, faulty
+from sfa_localization.motion.sources import ALIKE, EQUAL, LATE_S, late
 
 TRUTH, POINTS = 'ground truth', 'points_topic'
 WINDOW_M, WINDOWS_MIN, NOISE_M = 3.0, 4, 0.01

@@ -17,9 +17,9 @@ from scipy.special import logit
 from sfa_localization.data.geometry import Array, Mask, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile, surprise
-from sfa_localization.metric.dead_reckoning import GAP_MAX_S, without_pause
-from sfa_localization.metric.motion_samples import OUTLIER, fault_sentence, faulty
-from sfa_localization.metric.motion_sources import (
+from sfa_localization.motion.dead_reckoning import GAP_MAX_S, without_pause
+from sfa_localization.motion.samples import OUTLIER, fault_sentence, faulty
+from sfa_localization.motion.sources import (
     EQUAL,
     GYRO,
     IMAGES,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sfa_localization.data.geometry import Array, Indices, Mask
-from sfa_localization.metric.settings import GroundConfig
+from sfa_localization.mapping.settings import GroundConfig
 
 # Images farther from the one before are drawn apart: the drive between them is not in the map.
 _JOINED_M = 1.0

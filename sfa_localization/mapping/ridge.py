@@ -19,7 +19,7 @@ import numpy as np
 import scipy.linalg
 
 from sfa_localization.data.geometry import Array, Complex, Indices
-from sfa_localization.metric.basis import Basis, expand, missing
+from sfa_localization.mapping.basis import Basis, expand, missing
 from sfa_localization.metric.stack import Stack
 
 

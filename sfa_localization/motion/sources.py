@@ -17,7 +17,7 @@ from sfa_localization.data.events import CLOCK_RANGE_S
 from sfa_localization.data.geometry import Array, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, parabola_peak, quantile
-from sfa_localization.metric.dead_reckoning import summed, without_pause
+from sfa_localization.motion.dead_reckoning import summed, without_pause
 
 IMAGES, POSE, TWIST, GYRO = 'images', 'odometry pose', 'odometry twist', 'gyroscope'
 MAP = 'map'

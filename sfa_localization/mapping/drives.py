@@ -22,20 +22,21 @@ from sfa_localization.data.sphere import Sphere
 from sfa_localization.keyframes.closures import Closures, Textures
 from sfa_localization.keyframes.offsets import Offsets, find_offsets
 from sfa_localization.keyframes.turning import lever_square
-from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
-from sfa_localization.metric.drive_check import ROUTE
-from sfa_localization.metric.learning import MetricResult, learn_metric
+from sfa_localization.mapping.drive_check import ROUTE
+from sfa_localization.mapping.learning import MetricResult, learn_metric
+from sfa_localization.mapping.settings import MetricConfig
+from sfa_localization.mapping.turned_maps import TurnedMaps
 from sfa_localization.metric.loops import rough_offsets, with_closures
 from sfa_localization.metric.measured_points import MeasuredPoints, Settled, settle
-from sfa_localization.metric.motion_check import MotionCheck
-from sfa_localization.metric.motion_sources import compare_map
 from sfa_localization.metric.mount import MOUNTED_ANEW_RAD, Mount
-from sfa_localization.metric.odometry_errors import way_of
 from sfa_localization.metric.pose_graph import Graph, graph_poses
 from sfa_localization.metric.segments import Segments, cut_track, join
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
-from sfa_localization.metric.turned_maps import TurnedMaps
-from sfa_localization.metric.turns import Headings, estimated
+from sfa_localization.motion.check import MotionCheck
+from sfa_localization.motion.dead_reckoning import OdometryTrack, Way
+from sfa_localization.motion.odometry_errors import way_of
+from sfa_localization.motion.settings import SegmentConfig
+from sfa_localization.motion.sources import compare_map
+from sfa_localization.motion.turns import Headings, estimated
 
 Maps = tuple[MetricResult, TurnedMaps | None, MetricResult]
 """The first map, turned maps, and the map of these, or the first again."""

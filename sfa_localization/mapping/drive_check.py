@@ -11,8 +11,8 @@ import numpy as np
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.data.statistics import quantile
+from sfa_localization.mapping.map_fit import MapFit
 from sfa_localization.metric.links import Links
-from sfa_localization.metric.map_fit import MapFit
 from sfa_localization.metric.stack import Stack
 
 ANGLE_STD_MAX_DEG = 10.0

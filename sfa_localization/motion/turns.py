@@ -30,7 +30,7 @@ from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Stamps
 from sfa_localization.data.statistics import outlier_factor
 from sfa_localization.keyframes.closures import Closures
-from sfa_localization.metric.dead_reckoning import OdometryTrack, summed
+from sfa_localization.motion.dead_reckoning import OdometryTrack, summed
 
 REACH_M = 4.0
 """Way over which things beside it turn images by a constant angle per meter, at most."""

@@ -15,7 +15,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, Complex, Indices, Mask, wrap_angle
 from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Count, Odometry, Stamps, YawRate, differences
-from sfa_localization.metric.settings import SegmentConfig
+from sfa_localization.motion.settings import SegmentConfig
 
 GAP_MAX_S = 0.5
 """Longer pauses of odometry or gyroscope are breaks: the robot may have been moved meanwhile."""

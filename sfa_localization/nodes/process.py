@@ -1,0 +1,16 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The nodes as processes: their names, the signals that end them, and their exit codes."""
+
+from __future__ import annotations
+
+import signal
+
+NODES = {
+    'omnicam_node': 'ROS 2 node: camera images to panoramas (--ros-args -p NAME:=VALUE).',
+    'sfa_node': 'ROS 2 node: panoramas to slow features and poses.',
+    'ekf_node': 'ROS 2 node: poses and odometry to the pose in the map.',
+}
+CANNOT_START, DIED = 1, 2
+"""Exit codes: a launch ends if a node cannot start, and restarts a node that died."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
