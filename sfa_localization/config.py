@@ -135,7 +135,8 @@ def ignored_sections(path: Path | str, node: str) -> list[str]:
     `node` is the full name, such as /robot1/ekf_node. The name in the key is misspelt, or if no
     section matches, its namespace is wrong. Raises ConfigError for an unreadable file.
     """
-    keys, name = [*_sections(Path(path))], _node_of(node)
+    keys = [*_sections(Path(path))]
+    name = _node_of(node)
     same_name = [key for key in keys if _node_of(key) == name]
     misspelt = [
         key

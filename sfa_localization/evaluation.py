@@ -127,7 +127,8 @@ def evaluate(
     DataError, also without ground truth.
     """
     recipe = as_live(recipe or Recipe(), model.panorama, model.lens)
-    recipe, drives = replace(recipe, origin=model.origin), list[_Located]()
+    recipe = replace(recipe, origin=model.origin)
+    drives = list[_Located]()
     for path in align_bags:
         here = _with_topics_of(path, recipe)
         drives.append(_located(path, Observer(model, watch), here, progress))
@@ -152,7 +153,9 @@ def _judged(
     corrections: tuple[str, ...],
 ) -> Evaluation:
     """Feed a filter with a drive, and compare the estimates with the truth."""
-    stamps_ns, observations, truth = drive.run.panoramas.stamps_ns, drive.observations, drive.true
+    stamps_ns = drive.run.panoramas.stamps_ns
+    observations = drive.observations
+    truth = drive.true
     fed = replay(fused, drive.run.odometry, stamps_ns, observations)
     outputs = [(at, fused.status.level, fused.at(at)) for at, image, _ in fed if image is None]
     states = [state for *_, state in outputs if state]
@@ -196,7 +199,8 @@ def observed(
 
 
 def _observations(run: Run, observer: Observer, progress: bool) -> list[Observation]:
-    title, images = f'locate the images of {run.name}', observer.observe_run(run)
+    title = f'locate the images of {run.name}'
+    images = observer.observe_run(run)
     return list(progress_over(images, title, len(run.panoramas), visible=progress))
 
 
@@ -241,7 +245,8 @@ def _compared(
     assert run.ground_truth is not None
     check = check_motion(run.odometry, turns, run.yaw_rate, commands=open_loop)
     track = OdometryTrack.of(check.odometry, SegmentConfig(), check.gyro)
-    clock, (stamps_ns, headings) = camera_clock(run.odometry, *turns), turns
+    clock = camera_clock(run.odometry, *turns)
+    (stamps_ns, headings) = turns
     stamps_ns = stamps_ns - clock.delay_ns
     shown = [Headings.of(track, stamps_ns, headings.tolist())] if len(stamps_ns) > 1 else []
     for turns_of in (shown and estimated(shown, Closures.none())) or ():
@@ -269,7 +274,8 @@ def _located(
     usable = [observation for observation in observations if not observation.problem]
     if not usable:
         raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
-    turns, open_loop = _turns(run, observations), OpenLoop.of(run.odometry.twists).repeats
+    turns = _turns(run, observations)
+    open_loop = OpenLoop.of(run.odometry.twists).repeats
     check, true, clock = _compared(run, turns, open_loop, observer.model.rig, usual)
     late = check.image_drift or Drift(0, clock.delay_ns * 1e-9, 0.0)
     if open_loop:  # the robot is late, not the images
@@ -296,7 +302,9 @@ def _counts(
     drive: _Located, outputs: Sequence[tuple[int, Level, State | None]], fused: PoseFilter
 ) -> dict[str, Any]:
     """Used and skipped messages and images, the filter's counts, and seconds in each state."""
-    run, observations, clock = drive.run, drive.observations, drive.clock
+    run = drive.run
+    observations = drive.observations
+    clock = drive.clock
     skipped = Counter(problem for item in observations if (problem := item.problem))
     usable = Count(len(observations) - skipped.total(), dict(skipped))
     states_s = Counter[str]()
@@ -447,7 +455,8 @@ def score(truth: Trajectory, estimate: Trajectory) -> dict[str, Any]:
     are None where the truth covers no estimate.
     """
     _, errors = _errors(truth, estimate)
-    position, yaw = np.hypot(*errors[:, :2].T), np.degrees(np.abs(errors[:, 2]))
+    position = np.hypot(*errors[:, :2].T)
+    yaw = np.degrees(np.abs(errors[:, 2]))
     yaw = yaw[np.isfinite(yaw)]
     if len(position) == 0:
         return {**dict.fromkeys(('mean', 'median', 'p95', 'rmse', 'max')), 'n': 0, 'yaw_deg': None}
@@ -461,5 +470,7 @@ def score(truth: Trajectory, estimate: Trajectory) -> dict[str, Any]:
 
 
 def _summary(values: Array) -> dict[str, float]:
-    mean, median, p95 = values.mean(), np.median(values), np.percentile(values, 95)
+    mean = values.mean()
+    median = np.median(values)
+    p95 = np.percentile(values, 95)
     return {'mean': float(mean), 'median': float(median), 'p95': float(p95)}

@@ -73,7 +73,8 @@ def read_table(path: Path | str, names: Sequence[str]) -> Table:
     rows = [_SEPARATOR.split(lines[number - 1]) for number in numbers]
     named = bool(rows) and math.isnan(_number(rows[0], 0))
     header = [cell.strip('"') for cell in rows[0]] if named else list(names)
-    rows, numbers = rows[named:], numbers[named:]
+    rows = rows[named:]
+    numbers = numbers[named:]
     stamp, scale = ('stamp_ns', 1) if 'stamp_ns' in header else (names[0], SECOND_NS)
     for name in (stamp, *names[1:3]):
         if name not in header:
@@ -124,13 +125,16 @@ def run_filter(
         )
     # Logs may count from zero, but to the filter zero means no stamp.
     shift = max(0, SECOND_NS - min(a, c))
-    fused, twists = PoseFilter(config, ErrorCorrelation(share=0.0)), np.nan_to_num(odometry.values)
+    fused = PoseFilter(config, ErrorCorrelation(share=0.0))
+    twists = np.nan_to_num(odometry.values)
     no_poses = np.full((len(twists), 3), np.nan)
     driven = Odometry(odometry.stamps_ns + shift, no_poses, twists[:, :2], twists[:, 2:])
     rows = positions.stamps_ns + shift, map(_Position.of, positions.values)
     steps = replay(fused, driven, *rows)
     total = len(twists) + len(positions.values)
-    moved_ns, states, updates = None, dict[int, State](), list[Update]()
+    moved_ns = None
+    states = dict[int, State]()
+    updates = list[Update]()
     for stamp_ns, _, update in progress_over(steps, 'filter', total, 'rows', visible=progress):
         if update is not None:
             updates.append(update)

@@ -49,17 +49,22 @@ from sfa_localization.metric.segments import PIECE_LENGTH_M
 from sfa_localization.motion.check import MotionCheck, check_motion
 from sfa_localization.motion.sources import IMAGES, POSE, late
 
-SAMPLES, SAMPLE_SIDE = 16, 640
+SAMPLES = 16
+SAMPLE_SIDE = 640
 """Number of images on the contact sheet, and their longer side (pixels)."""
 SECTORS = 6
 """Number of driving directions, of 30 degrees each; forth and back are the same."""
 # A drive needs directions, each with a share of the path, or the shape of the map is ambiguous, and
 # a covered share of the area, or the map is extrapolated over whole regions.
-MIN_DIRECTIONS, MIN_SHARE, MIN_COVERED = 3, 0.05, 0.65
+MIN_DIRECTIONS = 3
+MIN_SHARE = 0.05
+MIN_COVERED = 0.65
 MOVED_M = 1.0  # a shorter drive covers no area
 MAX_WITHOUT_ODOMETRY = 0.1  # share of images; more means that the clocks differ
 MAX_GAP_S = 2.0  # longer pauses of a topic are reported
-EVEN, EVEN_SHARE = 3.0, 0.9  # a topic is periodic if this share of intervals is below 3 medians
+# a topic is periodic if this share of intervals is below 3 medians
+EVEN = 3.0
+EVEN_SHARE = 0.9
 MAX_REPEATED = 0.05  # share of images that repeat the last one; more are reported
 STANDING_M = 0.02  # between images of a robot that stands
 GRID = 100  # points per axis at which coverage is evaluated
@@ -67,7 +72,10 @@ TILT_PAIRS = 50  # that show the tilt of the ground
 DARK = 12.0  # mean gray level of 255 below which an image is dark
 
 # Pairs of images at a place with different headings show the lever arm of the camera.
-SAME_PLACE_M, OTHER_HEADING_RAD, MIN_PAIRS, COMPARED = 0.5, math.radians(30.0), 10, 2000
+SAME_PLACE_M = 0.5
+OTHER_HEADING_RAD = math.radians(30.0)
+MIN_PAIRS = 10
+COMPARED = 2000
 NO_LEVER_ARM = (
     'no place is seen in two headings, so nothing shows where the camera sits on the robot: turn '
     'on the spot where you have been, or set camera_xy'
@@ -248,7 +256,8 @@ def inspect(
 
     Raises BagError when nothing in it can be read.
     """
-    topics, config = topics or TopicNames(), config or InspectionConfig()
+    topics = topics or TopicNames()
+    config = config or InspectionConfig()
     report = BagReport(str(path))
     with Bag(path, strict=strict) as bag:
         report.image_topic = _topic_of(bag, 'image', topics.image, report)
@@ -302,7 +311,8 @@ class _Survey:
     """One pass over all topics of a bag."""
 
     def __init__(self, bag: Bag, report: BagReport, topics: TopicNames, clockwise: bool) -> None:
-        self._bag, self._report = bag, report
+        self._bag = bag
+        self._report = report
         # None without a topic: in damaged bags, '' can be the name of a topic.
         self._image = report.image_topic or None
         self._odometry = report.odometry_topic.partition(':')[0] or None
@@ -310,10 +320,13 @@ class _Survey:
         has_imu = topics.imu or decoding.IMU in recorded
         self._imu = (_topic_of(bag, 'imu', topics.imu, report) if has_imu else '') or None
         self._values: dict[str | None, list[tuple[int, Any]]] = {name: [] for name in bag.topics}
-        self._gyro, self._frozen, self._repeats = VisualGyro(clockwise), FrozenWatch(), 0
+        self._gyro = VisualGyro(clockwise)
+        self._frozen = FrozenWatch()
+        self._repeats = 0
         self._sizes: Counter[tuple[int, ...]] = Counter()
         count = bag.topics[self._image].count if self._image else 0
-        self._every, self._tilt_every = max(count // SAMPLES, 1), -(-count // body.IMAGES) or 1
+        self._every = max(count // SAMPLES, 1)
+        self._tilt_every = -(-count // body.IMAGES) or 1
         self._sphere = PanoramaConfig(clockwise=clockwise).sphere
         self._rolls_and_pitches: list[tuple[float, float]] = []
 
@@ -322,7 +335,8 @@ class _Survey:
         streams = {name: self._stream(name) for name in self._bag.topics}
         for stream, stamp_ns, value in self._bag.read(streams.values()):
             self._values[stream.topic].append((stamp_ns, value))
-        report, samples = self._report, self._report.samples
+        report = self._report
+        samples = self._report.samples
         report.topics = [self._topic(stream) for stream in streams.values()]
         if samples:
             ((height, width), _), *_ = self._sizes.most_common(1)
@@ -399,7 +413,8 @@ class _Survey:
 
     def _drive(self, odometry: Odometry) -> None:
         """Fill in the path, the tilt, and the comparison with images and gyroscope."""
-        report, camera = self._report, self._report.camera
+        report = self._report
+        camera = self._report.camera
         images = self._values.get(self._image, [])
         stamps = np.array([stamp for stamp, _ in images], np.int64)
         yaw = np.array([yaw for _, (yaw, *_) in images], float)
@@ -420,7 +435,8 @@ class _Survey:
         contrasts = {k: c for k, (_, (*_, c)) in enumerate(images) if c is not None}
         self._see(odometry, stamps, contrasts)
         near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
-        broken, report.odometry = report.motion.odometry, odometry
+        broken = report.motion.odometry
+        report.odometry = odometry
         part = broken.part[np.searchsorted(broken.stamps_ns[1:-1], near, 'right')]
         report.drives = np.split(odometry.trajectory.at(near), np.flatnonzero(np.diff(part)) + 1)
 
@@ -432,7 +448,8 @@ class _Survey:
         """
         if len({contrast.shape for contrast in contrasts.values()}) != 1:
             return
-        rows, textures = np.array([*contrasts]), np.concatenate([*contrasts.values()])
+        rows = np.array([*contrasts])
+        textures = np.concatenate([*contrasts.values()])
         pair = self._report.motion and self._report.motion.pair(POSE, IMAGES)
         if not (pair and pair.independent):
             headings = odometry.trajectory.at(stamps[rows])[:, 2]
@@ -474,7 +491,8 @@ def covered_share(places: Array, reach_m: float) -> float:
         hull = Delaunay(places[:, :2])
     except (QhullError, ValueError):  # too few places, or all on a line
         return 0.0
-    low, high = places[:, :2].min(0), places[:, :2].max(0)
+    low = places[:, :2].min(0)
+    high = places[:, :2].max(0)
     axes = [np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
     ground = grid[hull.find_simplex(grid) >= 0]
@@ -508,7 +526,8 @@ def headings_differ(places: Array) -> bool:
     """Whether a robot came back to enough of its poses (N, 3) with another heading."""
     moved = np.hypot(*np.diff(places[:, :2], axis=0, prepend=places[:1, :2]).T)
     rows = evenly(len(places), COMPARED)
-    driven, places = np.cumsum(moved)[rows], places[rows]
+    driven = np.cumsum(moved)[rows]
+    places = places[rows]
     first, last = cKDTree(places[:, :2]).query_pairs(SAME_PLACE_M, output_type='ndarray').T
     again = np.abs(driven[first] - driven[last]) >= STRETCH_M
     turned = np.abs(wrap_angle(places[first, 2] - places[last, 2])) >= OTHER_HEADING_RAD

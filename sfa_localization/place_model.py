@@ -112,7 +112,8 @@ class PlaceModel:
             panoramas = filled(panoramas, self.repeated)
         if not self.lean:
             return panoramas
-        lean, sphere = np.array(self.lean), self.panorama.sphere
+        lean = np.array(self.lean)
+        sphere = self.panorama.sphere
         return np.stack([leveled(panorama, lean, sphere) for panorama in panoramas])
 
     def views(self, panoramas: Image) -> list[View]:
@@ -146,14 +147,16 @@ class PlaceModel:
         """The pose of base_link; its covariance includes the errors that all images share: those of
         the map, and of its scale about its center.
         """
-        errors, center = self.keyframes.errors, self.keyframes.poses[:, :2].mean(0)
+        errors = self.keyframes.errors
+        center = self.keyframes.poses[:, :2].mean(0)
         of_map = np.array([errors.map_m, errors.map_m, errors.turn_std])
         covariance = location.covariance + np.diag(of_map**2)
         by_scale = self.rig.wheel_scale.std * (location.pose[:2] - center)
         covariance[:2, :2] += np.outer(by_scale, by_scale)
         pose, covariance = self.rig.base(location.pose, covariance, location.facing)
         covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
-        explained, tilt = location.fit.explained, location.tilt
+        explained = location.fit.explained
+        tilt = location.tilt
         return Observation(pose, covariance, view.slow_features, explained, tilt=tilt)
 
     def save(self, path: Path) -> None:
@@ -290,7 +293,8 @@ def network_from(arrays: Arrays, header: Mapping[str, Any]) -> Network:
     architecture = Architecture(**spec)
     if sum(name.endswith('/linear_offset') for name in arrays) != len(architecture.layers):
         raise ModelError('it has weights of more or fewer layers than its network')
-    nodes, deltas = [], []
+    nodes = []
+    deltas = []
     for depth in range(len(architecture.layers)):
         part = _under(arrays, f'network/{depth}/')
         deltas.append(np.asarray(part.pop('delta'), float))

@@ -86,7 +86,8 @@ def train(
     from it and gives the same bytes (the engine mdp starts again). Raises BagError, ConfigError,
     DataError or ModelError; then no model is written.
     """
-    recipe, output = recipe or Recipe(), Path(output)
+    recipe = recipe or Recipe()
+    output = Path(output)
     cache = image_folder(output)
     recipe, lens = with_lens(bags, recipe, progress)
     runs = read_drives(bags, cache, recipe, progress, strict=strict)  # step 1
@@ -116,7 +117,8 @@ def learn_place(
 
 def _maps(given: TrainingInput, images: ImageFeatures, strict: bool) -> tuple[Segments, Maps]:
     """Steps 5 to 7; measured points repeat them in the frame of the points."""
-    config, seed = given.recipe.metric, given.recipe.network.seed
+    config = given.recipe.metric
+    seed = given.recipe.network.seed
     sign = -1.0 if given.panorama.clockwise else 1.0
 
     def turned(segments: Segments, first: MetricResult) -> Maps:

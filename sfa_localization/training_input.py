@@ -97,7 +97,8 @@ class TrainingInput:
         """Step 2: level the images, find loop closures, and with them calibrate the odometry."""
         sphere = recipe.panorama.sphere
         runs = without_hidden(runs, sphere)
-        seen, lean = runs[0].seen, camera_lean(runs, sphere)
+        seen = runs[0].seen
+        lean = camera_lean(runs, sphere)
         if lean.any():
             logger.warning('%s', leaning(*lean))
         runs = [upright_run(run, lean, sphere) for run in runs]
@@ -114,7 +115,8 @@ class TrainingInput:
         lever_arm = next((run.camera for run in runs if run.camera is not None), None)  # by tf
         if recipe.metric.camera_xy:
             lever_arm = complex(*recipe.metric.camera_xy)
-        items, tracked = tuple(map(drive_of, runs)), (lens.place, PLACE_STD_M) if lens else None
+        items = tuple(map(drive_of, runs))
+        tracked = (lens.place, PLACE_STD_M) if lens else None
         mount = replace(Mount.at(lever_arm), tracked=tracked)
         drives = Drives(items, closures, recipe.segments, points=points, mount=mount)
         drives = drives.measured(views, sphere)
@@ -141,7 +143,8 @@ class TrainingInput:
     @property
     def sequences(self) -> list[ImageSequence]:
         """Training data of the network: the images of each drive, and pairs at loop closures."""
-        rotations, clockwise = self.architecture.rotations, self.recipe.panorama.clockwise
+        rotations = self.architecture.rotations
+        clockwise = self.recipe.panorama.clockwise
         sequences = [ImageSequence.of(run) for run in self.runs]
         images = [run.panoramas for run in self.runs]
         return sequences + edges_between(images, self.drives.closures, rotations, clockwise)
@@ -158,9 +161,12 @@ class TrainingInput:
 
 def train_hierarchy(given: TrainingInput, checkpoint: Checkpoint) -> Network:
     """Step 3, section 2 of the paper; continues from a checkpoint if there is one."""
-    architecture, sequences = given.architecture, given.sequences
-    start, seed = checkpoint.read(architecture), given.recipe.network.seed
-    passes, done = 2 * len(architecture.layers), start.stages if start else 0
+    architecture = given.architecture
+    sequences = given.sequences
+    start = checkpoint.read(architecture)
+    seed = given.recipe.network.seed
+    passes = 2 * len(architecture.layers)
+    done = start.stages if start else 0
     title = titled(3, f'learn slow features in {passes} passes')
     images = sum(len(sequence.panoramas) for sequence in sequences)
     with progress_bar(title, images * passes, initial=images * done, visible=given.progress) as bar:
@@ -189,7 +195,8 @@ def with_lens(
     A described lens stays, and is compared with that of the drive. Raises BagError, and CameraError
     where no bag shows the lens of images that are no panoramas.
     """
-    lens, problems = None, list[CameraError]()
+    lens = None
+    problems = list[CameraError]()
     for bag in bags:
         try:
             lens = lens_of(bag, recipe, progress)
@@ -228,8 +235,10 @@ def compared(
 def _compared(run: Run, recipe: Recipe, force: bool) -> tuple[Run, MotionCheck]:
     """A drive as its own comparison corrects it: its measured points, too, by the odometry."""
     turns, textures = turns_and_textures(run.panoramas, recipe.panorama.clockwise)
-    commands, stamps_ns = OpenLoop.of(run.odometry.twists).repeats, run.panoramas.stamps_ns
-    images, views = (stamps_ns, turns), (stamps_ns, textures)
+    commands = OpenLoop.of(run.odometry.twists).repeats
+    stamps_ns = run.panoramas.stamps_ns
+    images = (stamps_ns, turns)
+    views = (stamps_ns, textures)
     check = check_motion(run.odometry, images, run.yaw_rate, views=views, commands=commands)
     _warn(run, [*check.corrected, *check.notes, *(check.wrong if force else [])])
     if check.wrong and not force:

@@ -45,14 +45,17 @@ MOST_ADDED = 1000
 """Keyframes added in all, beside some 2,000 of the training: 2 MB."""
 MOST_OF_DRIVE = MOST_ADDED // 4
 """Keyframes added from a drive, so that several lights and seasons have room."""
-CERTAIN_M, CERTAIN_RAD = 0.15, 0.03
+CERTAIN_M = 0.15
+CERTAIN_RAD = 0.03
 """Largest standard deviations of the smoothed pose of a new keyframe: about the errors of a single
 image, so that new keyframes are as accurate as those of the training."""
-_CELL_M, _CELL_GROWTH = 0.2, 1.2
+_CELL_M = 0.2
+_CELL_GROWTH = 1.2
 """Size of the cells of which each gives a keyframe, and its growth until there are few enough."""
 _GATE = 11.3
 """Squared Mahalanobis distance that a right pose exceeds in 1 of 100 cases."""
-_QUANTILE, _SAMPLE = 0.05, 200
+_QUANTILE = 0.05
+_SAMPLE = 200
 """Quantile of how well keyframes are explained, and how many keyframes are sampled for it."""
 _GAP_NS = 500_000_000
 """Longest pause of the odometry in which a smoothed pose is used."""
@@ -103,7 +106,8 @@ def update(
 
     Raises BagError, DataError or ModelError; then no model is written.
     """
-    recipe, added = as_live(recipe or ReadingRecipe(), model.panorama, model.lens), []
+    recipe = as_live(recipe or ReadingRecipe(), model.panorama, model.lens)
+    added = []
     cache = image_folder(Path(output))
     for bag in bags:
         run = read_drive(bag, cache, recipe, progress, strict=strict)
@@ -131,7 +135,8 @@ def new_views(
     smoother = filter_of(model, replace(config, degraded_std=config.lost_std), Smoother)
     images = Observer(model, watch).observe_run(run)
     images = progress_over(images, f'replay {run.name}', len(run.panoramas), visible=progress)
-    observations, localised = list[Observation](), list[bool]()
+    observations = list[Observation]()
+    localised = list[bool]()
     for _, observation, _ in replay(smoother, run.odometry, run.panoramas.stamps_ns, images):
         if observation is not None:
             observations.append(observation)
@@ -155,7 +160,8 @@ def new_views(
 
 def usual_explained(model: PlaceModel) -> float:
     """The part of a keyframe that the others explain; 19 of 20 of the training exceed it."""
-    keyframes, first = model.keyframes, model.keyframes.first
+    keyframes = model.keyframes
+    first = model.keyframes.first
     explained = list[float]()
     for row in np.flatnonzero(first)[evenly(int(first.sum()), _SAMPLE)].tolist():
         fit = fit_among(keyframes, row, first & (np.arange(len(first)) != row))
@@ -166,7 +172,8 @@ def usual_explained(model: PlaceModel) -> float:
 def _smoothed(smoother: Smoother, model: PlaceModel, run: Run) -> tuple[Array, NDArray[np.bool_]]:
     """Smoothed poses (N, 3) of the images, and a mask (N,) of those that are certain."""
     smoothed = FilterTrack.of(smoother.smoothed())
-    track, covariances = smoothed.poses, smoothed.covariances
+    track = smoothed.poses
+    covariances = smoothed.covariances
     stamps = run.panoramas.stamps_ns
     clock = camera_clock(run.odometry, stamps, headings(run.panoramas))
     delay_ns = clock.delay_ns if clock.is_estimated else round(model.rig.camera_delay.value * 1e9)
@@ -215,7 +222,8 @@ def extended(model: PlaceModel, new: Additions, name: str) -> PlaceModel:
     """
     if not len(new):
         return model
-    old, rows = model.keyframes, _kept(model.keyframes, new.poses)
+    old = model.keyframes
+    rows = _kept(model.keyframes, new.poses)
     values, _ = encoded(new.textures, new.poses, old.sphere, old.seen, old)
     keyframes = replace(
         old,

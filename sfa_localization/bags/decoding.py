@@ -17,12 +17,16 @@ from sfa_localization.bags.satellite_fixes import fix_of
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.messages import read_odometry, read_planar, require_sane
 
-IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
-PACKET, VIDEO = 'ffmpeg_image_transport_msgs/msg/FFMPEGPacket', 'foxglove_msgs/msg/CompressedVideo'
+IMAGE = 'sensor_msgs/msg/Image'
+COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+PACKET = 'ffmpeg_image_transport_msgs/msg/FFMPEGPacket'
+VIDEO = 'foxglove_msgs/msg/CompressedVideo'
 VIDEOS = (PACKET, VIDEO)
 IMAGES = (IMAGE, COMPRESSED, *VIDEOS)
 """Types with an image of the camera; those without video are preferred, as they need no PyAV."""
-ODOMETRY, IMU, TF = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu', 'tf2_msgs/msg/TFMessage'
+ODOMETRY = 'nav_msgs/msg/Odometry'
+IMU = 'sensor_msgs/msg/Imu'
+TF = 'tf2_msgs/msg/TFMessage'
 STAMPED_POSES = (
     'geometry_msgs/msg/PoseStamped',
     'geometry_msgs/msg/PoseWithCovarianceStamped',
@@ -90,10 +94,12 @@ def pose_of(message: Any, needs_yaw: bool = True) -> tuple[float, float, float]:
     if kind == FIX:
         return (*fix_of(message)[:2], 0.0)
     if kind == 'geometry_msgs/msg/TransformStamped':
-        position, q = message.transform.translation, message.transform.rotation
+        position = message.transform.translation
+        q = message.transform.rotation
     else:
         pose = message.pose if kind == 'geometry_msgs/msg/PoseStamped' else message.pose.pose
-        position, q = pose.position, pose.orientation
+        position = pose.position
+        q = pose.orientation
     if needs_yaw or any((q.x, q.y, q.z, q.w)):
         return read_planar(position, q)
     require_sane('pose', position.x, position.y)
@@ -106,7 +112,8 @@ true_pose_of = functools.partial(pose_of, needs_yaw=False)
 
 def place_of(message: Any) -> tuple[float, float, float]:
     """Place x m, y m, or degrees of a fix, and its std, m, 0 if unknown. Raises MessageError."""
-    kind, variance = message.__msgtype__, 0.0
+    kind = message.__msgtype__
+    variance = 0.0
     if kind == FIX:
         return fix_of(message)
     if kind == 'geometry_msgs/msg/PointStamped':
@@ -114,7 +121,8 @@ def place_of(message: Any) -> tuple[float, float, float]:
     elif kind == 'geometry_msgs/msg/PoseStamped':
         point = message.pose.position
     else:
-        point, spread = message.pose.pose.position, message.pose.covariance
+        point = message.pose.pose.position
+        spread = message.pose.covariance
         variance = max(float(spread[0]), float(spread[7]), 0.0)
     require_sane('place', point.x, point.y, variance)
     return float(point.x), float(point.y), math.sqrt(variance)

@@ -102,7 +102,8 @@ def read_drives(
 
     Raises BagError or DataError.
     """
-    given, drives = replace(recipe, distinct=True), list[Run]()
+    given = replace(recipe, distinct=True)
+    drives = list[Run]()
     for bag in bags:
         drives.append(read_drive(bag, cache, given, progress, strict=strict))
         given = replace(given, origin=drives[-1].origin)
@@ -117,7 +118,8 @@ def read_drives(
         sizes = ', '.join(f'{r.name}: {r.panoramas.shape[1]}x{r.panoramas.shape[0]}' for r in runs)
         raise DataError(f'the bags hold panoramas of different sizes ({sizes}): train on one size')
     height, width, _ = runs[0].panoramas.shape
-    asked, usual = recipe.panorama, PanoramaConfig()
+    asked = recipe.panorama
+    usual = PanoramaConfig()
     if (asked.width, asked.height) not in {(width, height), (usual.width, usual.height)}:
         logger.warning(
             '%s: its panoramas are %dx%d and stay so: width and height (%dx%d) are for images of '
@@ -173,7 +175,8 @@ def read_drive(
     counts = {use: stream.count for use, stream in streams.items()}
     yaw_rate = to_yaw_rate(values['imu']) if values.get('imu') else None
     truth = to_trajectory(values['ground_truth']) if values.get('ground_truth') else None
-    seen, motion = stored.seen, (odometry, yaw_rate, truth)
+    seen = stored.seen
+    motion = (odometry, yaw_rate, truth)
     return Run(bag.path.name, panoramas, *motion, points, counts, camera, origin, seen)
 
 
@@ -230,7 +233,8 @@ class _PanoramaFile:
                 height, width = self._shape[:2]
                 raise MessageError(f'size is not {width}x{height} like the first image')
         size = image.shape[0], image.shape[1]
-        image, self._size = self._unwrap(image), size
+        image = self._unwrap(image)
+        self._size = size
         if self._watch is not None and not self._watch.add(image):
             self.repeats += 1
             raise MessageError('image repeats the one before')

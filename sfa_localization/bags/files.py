@@ -86,8 +86,11 @@ class McapFile:
     """
 
     def __init__(self, path: Path, problems: list[str]) -> None:
-        self._path, self._problems, self._file = path, problems, path.open('rb')
-        self.start_ns, self.topics = _LATEST, dict[int, Topic]()
+        self._path = path
+        self._problems = problems
+        self._file = path.open('rb')
+        self.start_ns = _LATEST
+        self.topics = dict[int, Topic]()
         damage = self._read_index()
         if not self.topics:
             self._scan()
@@ -126,7 +129,8 @@ class McapFile:
 
     def _scan(self) -> None:
         """Count the messages of a file without an index."""
-        channels, schemas = dict[int, Channel](), dict[int, Schema]()
+        channels = dict[int, Channel]()
+        schemas = dict[int, Schema]()
         counts: Counter[int] = Counter()
         for record in itertools.chain.from_iterable(self._parts(0)):
             if isinstance(record, Schema):
@@ -142,7 +146,8 @@ class McapFile:
         self, channels: dict[int, Channel], schemas: dict[int, Schema], counts: dict[int, int]
     ) -> None:
         for key, channel in channels.items():
-            schema, qos = schemas.get(channel.schema_id), channel.metadata.get(_QOS, '')
+            schema = schemas.get(channel.schema_id)
+            qos = channel.metadata.get(_QOS, '')
             fields = channel.topic, schema.name if schema else '', channel.message_encoding, qos
             self.topics[key] = make_topic(*fields, counts.get(key, 0))
 
@@ -168,12 +173,17 @@ class RosbagsFile:
     def __init__(
         self, path: Path, problems: list[str], reader: Sqlite3Reader | Ros1Reader, start_ns: int
     ) -> None:
-        self._path, self._problems, self._reader = path, problems, reader
-        self.start_ns, self.topics = start_ns, dict[int, Topic]()
+        self._path = path
+        self._problems = problems
+        self._reader = reader
+        self.start_ns = start_ns
+        self.topics = dict[int, Topic]()
         for key, name, kind, _, _, count, ext, _ in reader.connections:
-            form, qos = 'ros1', list[Qos]()
+            form = 'ros1'
+            qos = list[Qos]()
             if isinstance(ext, ConnectionExtRosbag2):
-                form, qos = ext.serialization_format, ext.offered_qos_profiles
+                form = ext.serialization_format
+                qos = ext.offered_qos_profiles
             self.topics[key] = make_topic(name, kind, form, qos, count)
 
     @classmethod

@@ -51,7 +51,8 @@ def _stamps(bag: Path, recipe: ReadingRecipe) -> tuple[Stamps, Trajectory]:
         images = opened.stamps(opened.find('image', recipe.topics.image))
         name = opened.find('odometry', recipe.topics.odometry)
         odometry = opened.stream(name, decoding.odometry_of)
-        stamps, values = list[int](), list[tuple[int, object]]()
+        stamps = list[int]()
+        values = list[tuple[int, object]]()
         for stream, stamp_ns, value in opened.read([images, odometry]):
             if stream is images:
                 stamps.append(stamp_ns)

@@ -61,8 +61,10 @@ def to_odometry(values: StampedValues, topic: str) -> tuple[Odometry, list[str],
     None where messages have only poses: then twists are the differences of poses. Raises DataError
     for two publishers, and where nothing is filled.
     """
-    stamps, poses = _stamps(values), np.array([pose for _, (pose, _) in values], float)
-    poses, has_twist = poses.reshape(-1, 3), bool(values) and values[0][1][1] is not None
+    stamps = _stamps(values)
+    poses = np.array([pose for _, (pose, _) in values], float)
+    poses = poses.reshape(-1, 3)
+    has_twist = bool(values) and values[0][1][1] is not None
     motion = [twist if has_twist else (0.0,) * 4 for _, (_, twist) in values]
     rows = np.column_stack([poses, np.array(motion, float).reshape(-1, 4)])
     empty = _empty(rows)
@@ -78,9 +80,11 @@ def to_odometry(values: StampedValues, topic: str) -> tuple[Odometry, list[str],
             'record each on a topic of its own and choose one with --odom-topic'
         )
     kept = ~(empty | aside)
-    stamps, (poses, twists, variances) = stamps[kept], np.split(rows[kept], (3, 5), axis=1)
+    stamps = stamps[kept]
+    (poses, twists, variances) = np.split(rows[kept], (3, 5), axis=1)
     if not has_twist:
-        twists, variances = differences(stamps, poses), np.zeros((len(stamps), 2))
+        twists = differences(stamps, poses)
+        variances = np.zeros((len(stamps), 2))
     odometry, oddity = _filled(Odometry(stamps, poses, twists, variances))
     counts = {'neither pose nor twist': int(empty.sum()), 'pose beside the path': int(aside.sum())}
     faults = {reason: count for reason, count in counts.items() if count}
@@ -92,14 +96,17 @@ def _empty(rows: Array) -> Mask:
     """Which messages (N, 7) of neither pose nor twist show nothing: those of a robot that stands
     do, where other messages have a twist and no pose either.
     """
-    posed, moves = np.isfinite(rows[:, 0]), rows[:, 3:5].any(axis=1)
+    posed = np.isfinite(rows[:, 0])
+    moves = rows[:, 3:5].any(axis=1)
     alone = np.append(False, posed[:-1]) & np.append(posed[1:], False)
     return np.asarray(~posed & ~moves & (alone | ~moves.any()))
 
 
 def _oriented(odometry: Odometry) -> bool:
-    orientation, seconds = Orientation(), (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
-    yaws, rates = odometry.poses[:, 2].tolist(), odometry.twists[:, 1].tolist()
+    orientation = Orientation()
+    seconds = (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
+    yaws = odometry.poses[:, 2].tolist()
+    rates = odometry.twists[:, 1].tolist()
     for message in zip(seconds.tolist(), yaws, rates, strict=True):
         orientation.add(*message)
     return orientation.is_filled
@@ -107,19 +114,25 @@ def _oriented(odometry: Odometry) -> bool:
 
 def _filled(odometry: Odometry) -> tuple[Odometry, str]:
     """Odometry with twists integrated where there are no poses, and a sentence on that or ''."""
-    stamps, poses, twists = odometry.stamps_ns, odometry.poses, odometry.twists
-    lacks, drives = np.isnan(poses[:, :1]), np.abs(twists[:, 0]).max(initial=0) > _DRIVING_MPS
+    stamps = odometry.stamps_ns
+    poses = odometry.poses
+    twists = odometry.twists
+    lacks = np.isnan(poses[:, :1])
+    drives = np.abs(twists[:, 0]).max(initial=0) > _DRIVING_MPS
     if lacks.any():
         count = f'{lacks.sum()} of {len(stamps)} messages'
         text = f'{count} have no pose (NaN, or a quaternion of zeros)'
     elif len(stamps) > 1 and drives and not np.ptp(poses, axis=0).any():
-        lacks, text = ~lacks, 'the pose is constant'
+        lacks = ~lacks
+        text = 'the pose is constant'
     elif len(stamps) > 1 and drives and not _oriented(odometry):
-        lacks, text = ~lacks, 'the orientation is never filled'
+        lacks = ~lacks
+        text = 'the orientation is never filled'
     else:
         return odometry, ''
     by_twist = integrate(stamps, twists)
-    step, integrated = relative(poses[:-1], poses[1:]), relative(by_twist[:-1], by_twist[1:])
+    step = relative(poses[:-1], poses[1:])
+    integrated = relative(by_twist[:-1], by_twist[1:])
     step = np.where(lacks[1:] | np.isnan(step), integrated, step)
     poses = chained(np.zeros(3) if lacks[0] else poses[0], step)
     return replace(odometry, poses=poses), f'{text}; the twist is integrated instead'

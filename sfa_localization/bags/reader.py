@@ -44,7 +44,8 @@ class Kind(NamedTuple):
     accepted: tuple[str, ...]
 
 
-_IMAGES, _TRUTH = decoding.IMAGES, decoding.STAMPED_POSES
+_IMAGES = decoding.IMAGES
+_TRUTH = decoding.STAMPED_POSES
 KINDS = {
     'image': Kind('images', '--image-topic', _IMAGES, _IMAGES),
     'odometry': Kind('odometry', '--odom-topic', (decoding.ODOMETRY,), decoding.POSES),
@@ -72,13 +73,15 @@ class Bag:
     def __init__(
         self, path: Path | str, *, strict: bool = False, config: BagConfig | None = None
     ) -> None:
-        self.path, self.strict = Path(path), strict
+        self.path = Path(path)
+        self.strict = strict
         self._by_header = (config or BagConfig()).stamp_source == 'header'
         self._streams: dict[str, Stream] = {}
 
     def __enter__(self) -> Bag:
         self.recording = Recording(self.path)
-        self.topics, self.problems = self.recording.topics, self.recording.problems
+        self.topics = self.recording.topics
+        self.problems = self.recording.problems
         self._raise_problems()
         return self
 
@@ -102,7 +105,8 @@ class Bag:
         topics = [t for t in topics if not PUBLISHED.search(t.name)] or topics
         topics = [t for t in topics if t.kind not in decoding.VIDEOS] or topics
         if not topics:
-            kinds, has = _short(wanted.usual, ' or '), self._contents(wanted)
+            kinds = _short(wanted.usual, ' or ')
+            has = self._contents(wanted)
             raise BagError(f'{self.path}: has no {wanted.title} ({kinds}); {has}')
         if len(topics) > 1:
             names = ', '.join(sorted(t.name for t in topics))
@@ -182,7 +186,8 @@ class Bag:
         """
         topic, _, frame = name.partition(':')
         stream = self._streams[topic] = Stream(self.path, topic, convert, self.strict)
-        stream.required, stream.opaque = required, not decoding.can_decode(self.topics[topic])
+        stream.required = required
+        stream.opaque = not decoding.can_decode(self.topics[topic])
         if required and self.topics[topic].kind == decoding.TF:
             stream.frame = frame
         if self.topics[topic].kind in decoding.IMAGES:
@@ -194,7 +199,8 @@ class Bag:
 
         Raises BagError when a topic has no usable message, or in strict reading on any loss.
         """
-        by_topic, receive_ns = dict[str, list[Stream]](), 0
+        by_topic = dict[str, list[Stream]]()
+        receive_ns = 0
         for stream in streams:
             by_topic.setdefault(stream.topic, []).append(stream)
         for record in self.messages(by_topic):

@@ -65,7 +65,8 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         self.path = path.parent if path.name == METADATA else path
-        self.problems, self.notes = list[str](), list[str]()
+        self.problems = list[str]()
+        self.notes = list[str]()
         self._files: list[StoredFile] = []
         self._open = ExitStack()
         names, topics = self._read_metadata()
@@ -145,7 +146,8 @@ class Recording:
 
     def _open_file(self, path: Path) -> StoredFile:
         """Open one file, or a decompressed copy, by its first bytes. Raises OSError or BagError."""
-        plain, damage = path, ''
+        plain = path
+        damage = ''
         if not path.exists():
             raise BagError(f'{path}: is missing; copy all files of the bag')
         if not path.is_file():

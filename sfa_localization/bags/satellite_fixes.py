@@ -12,8 +12,12 @@ from sfa_localization.data.errors import MessageError
 from sfa_localization.data.messages import require_sane
 from sfa_localization.data.run import Origin
 
-_SEMI_MAJOR_M, _ECCENTRICITY_SQUARE = 6_378_137.0, 6.694_379_990_14e-3  # of WGS84
-_STD_M, _STD_AUGMENTED_M, _AUGMENTED = 2.5, 0.3, 2
+# of WGS84
+_SEMI_MAJOR_M = 6_378_137.0
+_ECCENTRICITY_SQUARE = 6.694_379_990_14e-3
+_STD_M = 2.5
+_STD_AUGMENTED_M = 0.3
+_AUGMENTED = 2
 """Errors of fixes that state none: data sheets of single receivers promise 2.5 m. Drivers set the
 status GBAS for corrections of a base station, both for 0.02 m and for the 0.3 m of a float one."""
 
@@ -22,7 +26,8 @@ def fix_of(message: Any) -> tuple[float, float, float]:
     """Latitude and longitude, degrees, and std, m, of a NavSatFix. Raises MessageError."""
     if message.status.status < 0:
         raise MessageError('the receiver has no fix')
-    latitude, longitude = float(message.latitude), float(message.longitude)
+    latitude = float(message.latitude)
+    longitude = float(message.longitude)
     require_sane('place', latitude, longitude)
     if abs(latitude) > 90 or abs(longitude) > 360 or latitude == longitude == 0:
         raise MessageError('latitude and longitude are impossible')
@@ -40,7 +45,8 @@ def in_plane(fixes: StampedValues, origin: Origin) -> StampedValues:
 
 def east_north(latitude: float, longitude: float, origin: Origin) -> tuple[float, float]:
     """Place, m east and north, in the plane that touches the ellipsoid of WGS84 at the origin."""
-    first, turn = math.radians(origin[0]), math.radians(longitude - origin[1])
+    first = math.radians(origin[0])
+    turn = math.radians(longitude - origin[1])
     meridian = []  # distances from the axis and from the plane of the equator
     for angle in (math.radians(latitude), first):
         radius = _SEMI_MAJOR_M / math.sqrt(1 - _ECCENTRICITY_SQUARE * math.sin(angle) ** 2)

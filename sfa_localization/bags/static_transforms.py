@@ -20,7 +20,9 @@ def lever_arm(bag: Bag, sensor_topic: str, odometry_topic: str) -> complex | Non
     topic = bag.topics.get(TOPIC)
     if topic is None or not decoding.can_decode(topic):
         return None
-    frames, parents, transforms = dict[str, str](), dict[str, tuple[str, Array]](), 0
+    frames = dict[str, str]()
+    parents = dict[str, tuple[str, Array]]()
+    transforms = 0
     for record, _, data in bag.messages({TOPIC, sensor_topic, odometry_topic}):
         if record.name in frames and record.name != TOPIC:
             continue
@@ -47,7 +49,8 @@ def _links(message: object) -> dict[str, tuple[str, Array]]:
     """The parent of each frame, and the transform (4, 4) to it. Raises MessageError."""
     links = {}
     for part in message.transforms:  # type: ignore[attr-defined]
-        moved, turned = part.transform.translation, part.transform.rotation
+        moved = part.transform.translation
+        turned = part.transform.rotation
         require_sane('transform', moved.x, moved.y, moved.z, turned.x, turned.y, turned.z, turned.w)
         matrix = np.eye(4)
         matrix[:3, :3] = _rotation(np.array([turned.x, turned.y, turned.z]), float(turned.w))
@@ -69,7 +72,8 @@ def _rotation(axis: Array, real: float) -> Array:
 
 def _to_root(frame: str, parents: dict[str, tuple[str, Array]]) -> tuple[str, Array]:
     """The root of a frame's tree, and the transform (4, 4) to it; a loop ends at its start."""
-    matrix, passed = np.eye(4), set[str]()
+    matrix = np.eye(4)
+    passed = set[str]()
     while frame in parents and frame not in passed:
         passed.add(frame)
         frame, step = parents[frame]

@@ -102,7 +102,8 @@ class Stream:
 
     def push(self, item: Item) -> list[Used]:
         """The message to be used now, if any; the latest is held back until `flush`."""
-        waiting, last = self._waiting, self._last
+        waiting = self._waiting
+        last = self._last
         before = waiting or last
         if item.stamp_ns <= 0:
             self.skip(NO_STAMP)
@@ -113,14 +114,16 @@ class Stream:
             self._waiting = item
             self.skip('stamp jumps')
         else:
-            same, sound = item.stamp_ns == before.stamp_ns, item.continues(before)
+            same = item.stamp_ns == before.stamp_ns
+            sound = item.continues(before)
             other = 'stamp out of order' if sound else 'clock was set back'
             self.skip('duplicate stamp' if same else other)
         return []
 
     def flush(self) -> list[Used]:
         """The message held back."""
-        waiting, self._waiting = self._waiting, None
+        waiting = self._waiting
+        self._waiting = None
         return self._settled(waiting, None)
 
     def _settled(self, waiting: Item | None, following: Item | None) -> list[Used]:
@@ -146,8 +149,10 @@ def clock_offset(name: str, stream: Stream, odometry: Stream) -> tuple[int, str]
     both, and a sentence; 0 and '' for less than turns show, and for bags that do not hold the times
     of reception; 0 also for what queues may have delayed.
     """
-    (ahead, spread), (other, other_spread) = stream.ahead_ns, odometry.ahead_ns
-    offset_ns, range_ns = whole_leap(ahead - other), CLOCK_RANGE_S * 1e9
+    (ahead, spread) = stream.ahead_ns
+    (other, other_spread) = odometry.ahead_ns
+    offset_ns = whole_leap(ahead - other)
+    range_ns = CLOCK_RANGE_S * 1e9
     # If a bag holds no times of reception, stamps are ahead by the length of the drive.
     if abs(offset_ns) <= max(range_ns, spread, other_spread):
         return 0, ''

@@ -84,11 +84,13 @@ class BagWriter:
         if compressed is not None:
             message = self._stamped('sensor_msgs/msg/CompressedImage', stamp_ns, frame_id)
             data = encode_jpeg(image, quality) if compressed == 'jpeg' else encode_png(image)
-            message.format, message.data = compressed, np.frombuffer(data, np.uint8)
+            message.format = compressed
+            message.data = np.frombuffer(data, np.uint8)
         else:
             message = self._stamped('sensor_msgs/msg/Image', stamp_ns, frame_id)
             message.height, message.width = image.shape[:2]
-            message.encoding, message.step = 'bgr8', 3 * message.width
+            message.encoding = 'bgr8'
+            message.step = 3 * message.width
             message.data = np.ascontiguousarray(image, np.uint8).reshape(-1)
         self.message(topic, stamp_ns, message)
 
@@ -156,5 +158,7 @@ def blank(types: Typestore, kind: str) -> Any:
 def _place(pose: Any, values: Array) -> None:
     """Fill in a Pose from x m, y m, yaw rad."""
     x, y, yaw_rad = map(float, values)
-    pose.position.x, pose.position.y = x, y
-    pose.orientation.z, pose.orientation.w = float(np.sin(yaw_rad / 2)), float(np.cos(yaw_rad / 2))
+    pose.position.x = x
+    pose.position.y = y
+    pose.orientation.z = float(np.sin(yaw_rad / 2))
+    pose.orientation.w = float(np.cos(yaw_rad / 2))

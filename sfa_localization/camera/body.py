@@ -20,7 +20,9 @@ IMAGES = 400
 # A body is no wider than this share of the columns.
 _WIDEST = 0.6
 # Headings count alike, in bins of 30 degrees with enough images; of fewer bins, nothing is certain.
-_BINS, _FEWEST_IMAGES, _FEWEST_BINS = 12, 5, 6
+_BINS = 12
+_FEWEST_IMAGES = 5
+_FEWEST_BINS = 6
 
 
 def seen_mask(robot: Mask, size: tuple[int, int]) -> Mask:
@@ -33,9 +35,11 @@ def seen_mask(robot: Mask, size: tuple[int, int]) -> Mask:
 
 def sentences(robot: Mask, sphere: Sphere) -> list[str]:
     """What hides the view, by the mask (rows, columns) of the robot."""
-    height, half = robot.mean(axis=0), 180.0 / robot.shape[1]
+    height = robot.mean(axis=0)
+    half = 180.0 / robot.shape[1]
     begin = int(np.argmin(height))  # the clearest column
-    ring, texts = np.roll(np.arange(len(height)), -begin), []
+    ring = np.roll(np.arange(len(height)), -begin)
+    texts = []
     for (run,) in ndimage.find_objects(ndimage.label(height[ring] > 0)[0]):
         inside = ring[run]
         edges = np.degrees(sphere.azimuths(len(height)))[inside[[0, -1]]]

@@ -26,15 +26,21 @@ from sfa_localization.data.geometry import Array, Complex, Mask
 from sfa_localization.data.run import Image
 from sfa_localization.data.sphere import rotation
 
-_RAYS, _COARSE_RAYS = 360, 48  # directions from the center in which edges are searched
-_SEARCHED_PX, _COARSE_PX = 640, 160  # longer side of the image in the fine and the coarse search
+# directions from the center in which edges are searched
+_RAYS = 360
+_COARSE_RAYS = 48
+# longer side of the image in the fine and the coarse search
+_SEARCHED_PX = 640
+_COARSE_PX = 160
 _COARSE_STEP = 4  # px between the centers of the coarse search
 _TOLERANCE = 0.012  # of the radius, from an edge to the circle that it supports
 _TRIALS = 400  # random circles; enough to find the rim among two thirds of wrong edges
 _ENOUGH_FOR_MOTION = 3  # images; the change between two is mostly noise
 _BESIDE = np.array([0.03, 0.06, 0.09])  # samples on both sides of a circle, over its radius
 _CONTRAST = 0.06  # of the range of a cue: more than its noise, less than a dim scene at the rim
-_RIM_SUPPORT, _HOLE_SUPPORT = 0.3, 0.6  # the border may cut off a rim, but no hole
+# the border may cut off a rim, but no hole
+_RIM_SUPPORT = 0.3
+_HOLE_SUPPORT = 0.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +92,8 @@ def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
 
 def _enlarged(circle: Circle, scale: float) -> Circle:
     """The circle in the image, from that in an image shrunk by `scale`."""
-    column, row = (circle.column + 0.5) / scale - 0.5, (circle.row + 0.5) / scale - 0.5
+    column = (circle.column + 0.5) / scale - 0.5
+    row = (circle.row + 0.5) / scale - 0.5
     return Circle(column, row, circle.radius / scale, circle.support)
 
 
@@ -142,18 +149,21 @@ def _coarse_circle(cue: Array, contrast: float, rim: Circle | None, scale: float
         steps = [np.arange(-0.3, 0.31, _COARSE_STEP / side) * side for side in (width, height)]
         radii = np.geomspace(0.2 * min(cue.shape), 0.6 * math.hypot(*cue.shape), 40)
     else:
-        middle, reach = np.array([rim.column, rim.row]) * scale, rim.radius * scale
+        middle = np.array([rim.column, rim.row]) * scale
+        reach = rim.radius * scale
         steps = [np.linspace(-0.1, 0.1, 7) * reach] * 2
         radii = np.geomspace(max(0.05 * reach, 2.0), 0.6 * reach, 30)
     centers = middle + np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
-    best, circle = -np.inf, np.array([*middle, radii[0]])
+    best = -np.inf
+    circle = np.array([*middle, radii[0]])
     for radius in radii:
         bright, dark = _sides(cue, centers, radius, _COARSE_RAYS, rim is not None)
         visible = np.isfinite(dark).mean(1)
         kept = visible >= _RIM_SUPPORT
         if not kept.any():
             continue
-        bright, dark = bright[kept], dark[kept]
+        bright = bright[kept]
+        dark = dark[kept]
         level = np.nanmedian(dark, axis=1, keepdims=True) + contrast
         score = np.mean((bright > level) & (dark < level), 1) - np.mean(dark >= level, 1)
         score /= visible[kept] + _RIM_SUPPORT  # directions beyond the border do not count
@@ -253,12 +263,16 @@ def given_radii(radii: Sequence[float] | None) -> dict[str, Any]:
     return dict(zip(('radius_min', 'radius_max'), radii or (), strict=False))
 
 
-_GREEN, _RED, _YELLOW = (80, 220, 80), (60, 60, 255), (60, 230, 250)
+_GREEN = (80, 220, 80)
+_RED = (60, 60, 255)
+_YELLOW = (60, 230, 250)
 _CHECK_WIDTH = 1200  # px: the labels of a panorama of this width can be read
 _SIDES = {'FRONT': 0, 'LEFT': 90, 'BACK': 180, 'RIGHT': 270}
 _LOWEST_LABEL = -20  # degrees: lower ones would cover each other in a mirror
 _LABELS_DEG = 45  # azimuth of the labels of elevations
-_STEP, _NEAR = 4, 0.999  # step of the search for the pixel of a label, px; its least cosine
+# step of the search for the pixel of a label, px; its least cosine
+_STEP = 4
+_NEAR = 0.999
 
 
 def check_image(image: Image, unwrapper: Unwrapper) -> Image:
@@ -276,7 +290,8 @@ def check_image(image: Image, unwrapper: Unwrapper) -> Image:
     _draw(raw, rays, unwrapper.panorama)
     margin = (_CHECK_WIDTH - width) // 2
     framed = np.zeros((height + len(strip), _CHECK_WIDTH, 3), np.uint8)
-    framed[:height, margin : margin + width], framed[height:] = raw, strip
+    framed[:height, margin : margin + width] = raw
+    framed[height:] = strip
     return framed
 
 

@@ -120,7 +120,8 @@ def calibration_of_info(info: Any) -> LensCalibration:
         lens = _from_others({**named, 'k': list(info.k), 'd': list(info.d)})
         if info.roi.width and info.roi.height:  # columns and rows that the image has
             lens['cx'], lens['cy'] = lens['cx'] - info.roi.x_offset, lens['cy'] - info.roi.y_offset
-            lens['image_width'], lens['image_height'] = info.roi.width, info.roi.height
+            lens['image_width'] = info.roi.width
+            lens['image_height'] = info.roi.height
         return LensCalibration(**{'radius_min': 0.0, 'radius_max': 0.0, **lens})
     except (ConfigError, CameraError) as error:
         raise CameraError(f'{error}; or describe the camera by a calibration_file') from None
@@ -132,7 +133,8 @@ def _from_ocam(text: str) -> dict[str, Any]:
     numbers = [[float(entry) for entry in row] for row in rows]
     if len(numbers) < 5 or int(numbers[0][0]) != len(numbers[0]) - 1:
         raise CameraError('not the five rows of OCamCalib calib_results.txt')
-    (cy, cx), (height, width) = numbers[2], numbers[4]
+    (cy, cx) = numbers[2]
+    (height, width) = numbers[4]
     size = {'image_width': int(width), 'image_height': int(height)}
     lens = {'polynomial': tuple(numbers[0][1:]), 'affine': tuple(numbers[3])}
     return {'camera_model': 'ocam', 'cx': cx, 'cy': cy, **size, **lens}
@@ -197,7 +199,8 @@ def _from_others(named: Mapping[str, Any]) -> dict[str, Any]:
         return {'camera_model': 'equirectangular'}
     if any(_given(named, 'fisheye_model')):
         kinds = {'fisheye'}
-    numbers, xi = _given(named, *_MATRIX), _given(named, 'xi')
+    numbers = _given(named, *_MATRIX)
+    xi = _given(named, 'xi')
     has_mirror = bool(xi or kinds & _MIRRORS)
     unknown = kinds - _PINHOLES - (_MIRRORS if has_mirror else _FISHEYES)
     if unknown:
@@ -206,7 +209,8 @@ def _from_others(named: Mapping[str, Any]) -> dict[str, Any]:
             'omni or MEI, equidistant or KANNALA_BRANDT, or a pinhole with radtan'
         )
     if has_mirror and len(numbers) == 5:
-        xi, numbers = numbers[:1], numbers[1:]
+        xi = numbers[:1]
+        numbers = numbers[1:]
     if len(numbers) == 9:
         numbers = [numbers[0], numbers[4], numbers[2], numbers[5]]
     numbers = numbers or [_required(named, *names) for names in _FOCAL]

@@ -32,7 +32,9 @@ _SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.ppm', '.pgm', '.tif', '.tiff', '
 _USUAL_RATE_HZ = 10.0  # of a folder, and of a video that names none
 _OPENING_S = 10.0  # a device may need this long to open
 _IDLE_PAUSE_S = 0.02  # of a file while no image is wanted: shorter than a frame
-_REOPEN_FIRST_S, _REOPEN_LONGEST_S = 0.5, 30.0  # pauses before a source is reopened; they double
+# pauses before a source is reopened; they double
+_REOPEN_FIRST_S = 0.5
+_REOPEN_LONGEST_S = 30.0
 
 
 CapturedImages = Generator[Image | CameraError, None, None]
@@ -160,8 +162,10 @@ class Feed:
         wanted: Callable[[], bool] = lambda: True,
     ) -> None:
         self.config = config
-        self._open, self._deliver = open_source, deliver
-        self._reject, self._wanted = reject, wanted
+        self._open = open_source
+        self._deliver = deliver
+        self._reject = reject
+        self._wanted = wanted
         self._stopped = threading.Event()
         self._status = FeedStatus()
         self._pause_s = _REOPEN_FIRST_S
@@ -226,7 +230,8 @@ class Feed:
 
     def _back_off(self) -> None:
         self._deadline_s = np.inf
-        pause, self._pause_s = self._pause_s, min(2 * self._pause_s, _REOPEN_LONGEST_S)
+        pause = self._pause_s
+        self._pause_s = min(2 * self._pause_s, _REOPEN_LONGEST_S)
         self._stopped.wait(pause)
 
     def _read_all(self) -> None:

@@ -60,7 +60,9 @@ _LAYOUTS['nv21'] = _Layout(1, code=cv2.COLOR_YUV2BGR_NV21, rows=(3, 2))
 _SENSOR_BITS = (10, 12, 14, 16)  # depths of pixels that are sent as two bytes
 _CUT_OFF = 'cut-off JPEG: the data of a part of it are lost'
 _FILL = 128  # gray level of blocks for which libjpeg has no data
-_MARKER, _END = re.compile(rb'\xff[\x01-\xfe]'), b'\xff\xd9'  # in a JPEG, and the last one
+# in a JPEG, and the last one
+_MARKER = re.compile(rb'\xff[\x01-\xfe]')
+_END = b'\xff\xd9'
 _RESTARTS = range(0xD0, 0xD8)  # markers between parts of a JPEG, numbered in a circle
 _MORE_DATA = bytes(range(1, 65))
 _LARGEST_FILE = 1 << 28  # bytes of an image file
@@ -82,7 +84,8 @@ def decode_image(
         raise CameraError(f'unsupported encoding {encoding!r}')
     if min(height, width) <= 0 or step < 0:
         raise CameraError('empty image')
-    buffer, rows = _bytes(data), height * layout.rows[0] // layout.rows[1]
+    buffer = _bytes(data)
+    rows = height * layout.rows[0] // layout.rows[1]
     used = width * layout.channels * layout.depth
     if not step and buffer.size != rows * used:
         raise CameraError(

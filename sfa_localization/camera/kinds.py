@@ -18,13 +18,21 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image, Run
 from sfa_localization.data.statistics import evenly
 
-PANORAMA, EQUIRECTANGULAR, ORDINARY = 'panorama', 'equirectangular', 'ordinary camera'
-MIRROR, FISHEYE, DUAL_FISHEYE = 'mirror', 'fisheye', 'dual fisheye'
+PANORAMA = 'panorama'
+EQUIRECTANGULAR = 'equirectangular'
+ORDINARY = 'ordinary camera'
+MIRROR = 'mirror'
+FISHEYE = 'fisheye'
+DUAL_FISHEYE = 'dual fisheye'
 STEREO = 'stereo pair'
-_RADII, _ANGLES, _INNER = 30, 400, 10  # of an unrolled circle; the inner third shows the robot
+# of an unrolled circle; the inner third shows the robot
+_RADII = 30
+_ANGLES = 400
+_INNER = 10
 # Views side by side correlate by 1, or 0.5 when shifted by parallax, up to a share of their width;
 # opposite parts of a panorama by 0.1.
-_SAME, _PARALLAX = 0.35, 0.1
+_SAME = 0.35
+_PARALLAX = 0.1
 _SAMPLES = 16  # images of a drive that are checked
 
 
@@ -72,7 +80,8 @@ class Geometry(NamedTuple):
 def guess_geometry(samples: Sequence[Image]) -> Geometry:
     """The kind of camera of images (H, W, 3)."""
     height, width = samples[0].shape[:2]
-    ratio, twice = f'{width / height:.1f} times as wide as high', abs(width / height - 2) < 0.02
+    ratio = f'{width / height:.1f} times as wide as high'
+    twice = abs(width / height - 2) < 0.02
     closes = width > height and _closes(samples)
     if not closes and _same_twice(samples):
         return Geometry(STEREO, 'the left half shows the same as the right one')
@@ -113,7 +122,8 @@ def unrolled(image: Image) -> Image:
     height, width = image.shape[:2]
     if looks_like_panorama(height, width) or abs(width / height - 2) < 0.02:
         return image
-    center, reach = ((width - 1) / 2, (height - 1) / 2), min(height, width) / 2
+    center = ((width - 1) / 2, (height - 1) / 2)
+    reach = min(height, width) / 2
     polar = cv2.warpPolar(image, (_RADII, _ANGLES), center, reach, cv2.INTER_LINEAR)
     return np.ascontiguousarray(polar[:, _INNER:].transpose(1, 0, 2))
 
@@ -132,7 +142,8 @@ def _closes(samples: Sequence[Image]) -> bool:
     def change(columns: int) -> Array:
         return np.asarray(np.abs(gray - np.roll(gray, columns, axis=2)).mean((0, 1)))
 
-    neighbors, opposite = change(1), change(gray.shape[2] // 2)
+    neighbors = change(1)
+    opposite = change(gray.shape[2] // 2)
     return bool(neighbors[0] < np.sqrt(np.median(neighbors) * np.median(opposite)))
 
 

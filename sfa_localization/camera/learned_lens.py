@@ -44,16 +44,24 @@ PLACE_STD_M = 0.03
 """Standard deviation of each coordinate of the place: four rendered robots erred by 0.01 to 0.04
 m."""
 _YAWS = np.radians(np.arange(0.0, 360.0, 22.5))  # from which the search starts
-_SEARCH_POINTS, _POINTS, _CELLS = 150, 450, 16  # spread over cells along the longer side of images
+# spread over cells along the longer side of images
+_SEARCH_POINTS = 150
+_POINTS = 450
+_CELLS = 16
 _TRACKER_PX = 16.0  # of a sighting, as those of many tracks err alike: the claimed errors are right
 _SMALL_PX = 1.0  # residuals beyond count linearly
 _SHARP = 2.5  # times the median residual, beyond which a point is left out
 _PASSES = 2  # of leaving out points
-_STARTS, _SEARCH_STEPS, _STEPS = 2, 15, 40  # of least squares
+# of least squares
+_STARTS = 2
+_SEARCH_STEPS = 15
+_STEPS = 40
 _UNSEEN_PX = 50.0  # residual of a sighting that the camera cannot have
 _BLOCK = 10  # images whose errors of odometry are alike
 _LARGEST_ERROR_PX = 3.0  # median of a lens that fits: 0.5 to 1.2 in rendered gardens
-_LEAST_M, _LEAST_RAD, _LEAST_POINTS = 5.0, 2 * np.pi, 100
+_LEAST_M = 5.0
+_LEAST_RAD = 2 * np.pi
+_LEAST_POINTS = 100
 _NEARLY_ALL = 0.95  # of the directions
 
 
@@ -101,7 +109,8 @@ def learn_lens(
 def _require_enough(tracks: Tracks, odometry: Trajectory) -> None:
     """Raise CameraError where too little was seen, driven or turned."""
     steps = np.diff(odometry.at(tracks.stamps_ns), axis=0)
-    way, turn = np.hypot(*steps[:, :2].T).sum(), np.abs(wrap_angle(steps[:, 2])).sum()
+    way = np.hypot(*steps[:, :2].T).sum()
+    turn = np.abs(wrap_angle(steps[:, 2])).sum()
     lacks = []
     if way < _LEAST_M:
         lacks.append(f'drive {_LEAST_M:.0f} m, not {way:.1f}')
@@ -172,7 +181,8 @@ def _sharpened(problem: _Problem, x: Array) -> _Fit:
 
 def _learned(fit: _Fit, guess: LensGuess) -> LearnedLens:
     """Raises CameraError where no lens explains what was seen."""
-    problem, values = fit.problem, fit.values
+    problem = fit.problem
+    values = fit.values
     error_px = float(np.median(np.hypot(*problem.errors(fit.x).T)))
     std = dict(zip(problem.names, np.sqrt(np.diag(problem.covariance(fit))).tolist(), strict=True))
     if error_px > _LARGEST_ERROR_PX or len(problem.tracks) < _LEAST_POINTS // 2:
@@ -223,7 +233,8 @@ class _Problem:
     """The unknowns of one model, and the residuals of sightings."""
 
     def __init__(self, tracks: Tracks, odometry: Trajectory, model: LensModel) -> None:
-        self.tracks, self.model = tracks, model
+        self.tracks = tracks
+        self.model = model
         self.odometry = odometry
         prior = MOTION | model.prior
         self.names = tuple(prior)
@@ -264,7 +275,8 @@ class _Problem:
 
     def errors(self, x: Array) -> Array:
         """Where points should be seen, minus where they were (M, 2), px of the tracker."""
-        camera, tracks = self.camera(x), self.tracks
+        camera = self.camera(x)
+        tracks = self.tracks
         places, yaw = self.poses(x)
         turn = np.exp(1j * yaw[tracks.image])
         seen = _unproject(camera.lens, tracks.pixels) @ camera.rotation.T
@@ -295,7 +307,8 @@ class _Problem:
 
     def covariance(self, fit: _Fit) -> Array:
         """Covariance (K, K); errors of images in one stretch of the drive are alike."""
-        jacobian, rows = fit.jacobian, 2 * len(self.tracks.point)
+        jacobian = fit.jacobian
+        rows = 2 * len(self.tracks.point)
         block = np.repeat(self.tracks.image // _BLOCK, 2)
         slopes = jacobian[:rows] * self.residuals(fit.x)[:rows, None]
         sums = np.stack([np.bincount(block, slope) for slope in slopes.T])
@@ -348,7 +361,8 @@ def triangulated(point: Indices, places: Array, rays: Array, passes: int = 3) ->
     column = across @ centers[..., None]
     corner = np.sum(column * centers[..., None], axis=1, keepdims=True)
     squares = np.block([[across, -column], [-column.transpose(0, 2, 1), corner]])
-    ahead, weight = sums(rays), np.ones((len(point), 1))
+    ahead = sums(rays)
+    weight = np.ones((len(point), 1))
     for _ in range(passes):
         form = sums(weight[..., None] * squares)
         best = np.linalg.eigh(form)[1][:, :, 0]

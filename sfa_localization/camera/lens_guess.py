@@ -23,7 +23,9 @@ from sfa_localization.data.run import Image
 
 _CENTERED = 0.004  # of the radius: standard deviation of the lens's center about that of its rim
 _UNCERTAIN = 0.03  # the same for a rim that is hardly visible
-_CLEAR_SUPPORT, _CLEAR_SHARE = 0.9, 0.95  # of a rim's directions; of its disc that changes
+# of a rim's directions; of its disc that changes
+_CLEAR_SUPPORT = 0.9
+_CLEAR_SHARE = 0.95
 _EDGE_STD = np.radians(20.0)  # of the elevation of an edge of a panorama
 _STILL = 0.2  # share of the area beyond a rim, or in a hole, that changes
 _CONTRAST = 0.05  # relative difference of brightness that tells the sky from the ground
@@ -69,7 +71,8 @@ class LensGuess:
 
     def models(self, direction: int) -> list[LensModel]:
         """The models of lenses whose images rotate as those of camera `direction`."""
-        base, mirrored = self.base, ('no', 'yes')[direction]
+        base = self.base
+        mirrored = ('no', 'yes')[direction]
         if self.kind == kinds.DUAL_FISHEYE:
             return [lens_models.dual_fisheye(base, self.circles, upside_down=bool(direction))]
         if not self.circles:
@@ -78,7 +81,8 @@ class LensGuess:
             edges = [Quantity(edge, _EDGE_STD) for edge in (usual.low, usual.high)]
             edges = [] if self.kind == kinds.EQUIRECTANGULAR else edges
             return [lens_models.equirectangular(base, edges)]
-        (circle,), other = self.circles, ('yes', 'no')[direction]
+        (circle,) = self.circles
+        other = ('yes', 'no')[direction]
         up = replace(base, axis='up', mirrored=mirrored)
         down = replace(base, axis='down', mirrored=other)
         fisheyes = [lens_models.fisheye(lens, circle) for lens in (up, down)]
@@ -108,7 +112,8 @@ class LensGuess:
         outside = mean[(radius > 1.05 * horizon) & (radius < min(1.5 * horizon, circle.radius))]
         if not (inside.size and outside.size):
             return 0.0
-        bright, dark = float(outside.mean()), float(inside.mean())
+        bright = float(outside.mean())
+        dark = float(inside.mean())
         return (bright - dark) / (bright + dark + 1e-9)
 
 
@@ -122,7 +127,9 @@ def _camera(model: LensModel, base: LensCalibration) -> CameraModel:
 
 def _circle(samples: Sequence[Image], circles: MirrorCircles) -> LensCircle:
     """The rim with its hole; the whole image where it is no rim, as things move beyond it."""
-    moves, rim, hole = changing(samples), circles.rim, circles.hole
+    moves = changing(samples)
+    rim = circles.rim
+    hole = circles.hole
     height, width = moves.shape
     hole_radius = hole.radius if hole and not _share(moves, hole, 0.0, 0.8) > _STILL else 0.0
     if _share(moves, rim, 1.1, np.inf) > _STILL:

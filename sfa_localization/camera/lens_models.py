@@ -17,8 +17,11 @@ Values = Mapping[str, float]
 _RIGHT_ANGLE = np.pi / 2
 # Priors of the shapes. Unified model: hyperbolic mirrors have xi of 0.7 to 0.97, a parabolic one 1.
 # Kannala-Brandt: of the lenses in the examples of OpenCV and Kalibr, |k1| < 0.05 and |k2| < 0.01.
-_XI, _MIRROR_K1, _MIRROR_K2 = Quantity(0.9, 0.1), Quantity(0.0, 0.02), Quantity(0.0, 0.01)
-_FISHEYE_K1, _FISHEYE_K2 = Quantity(0.0, 0.03), Quantity(0.0, 0.006)
+_XI = Quantity(0.9, 0.1)
+_MIRROR_K1 = Quantity(0.0, 0.02)
+_MIRROR_K2 = Quantity(0.0, 0.01)
+_FISHEYE_K1 = Quantity(0.0, 0.03)
+_FISHEYE_K2 = Quantity(0.0, 0.006)
 _HORIZON_STD = 0.3  # of the rim's radius: the drive shows the horizon
 _UPRIGHT_STD = 0.1  # rad, between the axes of two lenses back to back
 LEAN_STD = 0.15
@@ -56,7 +59,9 @@ def mirror(base: LensCalibration, circle: LensCircle) -> LensModel:
     """The unified model of central mirrors; `horizon` is its radius, px."""
 
     def calibration(values: Values) -> LensCalibration:
-        xi, k1, k2 = values['xi'], values['k1'], values['k2']
+        xi = values['xi']
+        k1 = values['k1']
+        k2 = values['k2']
         plane = 1.0 / xi
         focal = values['horizon'] / (plane * (1 + k1 * plane**2 + k2 * plane**4))
         return replace(

@@ -17,7 +17,9 @@ from sfa_localization.data.rig import Quantity
 
 _MARGIN_DEG = 1.0  # inside of what the lens sees: its edge is blurred
 _BELOW_DEG = -3.0  # what lies lower shows by parallax where a robot is
-_LEAST_DEG, _CERTAIN = 1.5, 4.0  # of a difference: it matters, and exceeds so many deviations
+# of a difference: it matters, and exceeds so many deviations
+_LEAST_DEG = 1.5
+_CERTAIN = 4.0
 _LEAST_TURN_DEG = 3.0
 _WORSE = 0.25  # quantile of the cosine
 _BESIDE = 0.1  # sine of elevations at which a stretch of all hardly shows
@@ -25,7 +27,8 @@ _BESIDE = 0.1  # sine of elevations at which a stretch of all hardly shows
 
 def sentence(lens: LearnedLens) -> str:
     """Kind, horizon, center and view of a lens."""
-    parts, calibration = [lens.name], lens.calibration
+    parts = [lens.name]
+    calibration = lens.calibration
     if lens.horizon is not None:
         parts.append(f'horizon at {lens.horizon.value:.0f} px (+- {max(lens.horizon.std, 1):.0f})')
         center = f'{calibration.cx:.0f}, {calibration.cy:.0f}'
@@ -61,7 +64,8 @@ def fitting_panorama(panorama: PanoramaConfig, lens: LearnedLens) -> PanoramaCon
     edges = panorama.elevation_min, panorama.elevation_max
     if edges != (usual.elevation_min, usual.elevation_max):
         return panorama
-    lowest, highest = lens.sees[0] + _MARGIN_DEG, lens.sees[1] - _MARGIN_DEG
+    lowest = lens.sees[0] + _MARGIN_DEG
+    highest = lens.sees[1] - _MARGIN_DEG
     low = max(usual.elevation_min, lowest)
     high = min(low + usual.elevation_max - usual.elevation_min, highest)
     low = max(lowest, min(low, high - usual.elevation_max + usual.elevation_min))
@@ -98,7 +102,8 @@ def _of_circle(
 ) -> list[str]:
     """What a description says otherwise of a lens with one center."""
     size = lens.calibration.image_height, lens.calibration.image_width
-    shown, told = _Horizon.of(lens.calibration, size), _Horizon.of(described, size)
+    shown = _Horizon.of(lens.calibration, size)
+    told = _Horizon.of(described, size)
     texts = []
     std = max(horizon.std, 1.0)
     off = abs(told.radius - shown.radius)
@@ -107,7 +112,8 @@ def _of_circle(
             f'{name} puts the horizon at {told.radius:.0f} px, the drive shows '
             f'{shown.radius:.0f} (+- {std:.0f})'
         )
-    off, std = abs(told.center - shown.center), max(lens.center_std, 1.0)
+    off = abs(told.center - shown.center)
+    std = max(lens.center_std, 1.0)
     if off > max(_CERTAIN * std, _LEAST_DEG * shown.px_per_deg):
         texts.append(
             f'{name} puts the center at {told.center.real:.0f}, {told.center.imag:.0f}, the drive '
@@ -140,7 +146,8 @@ class _Horizon(NamedTuple):
         azimuth = np.radians(np.arange(0.0, 360.0, 5.0))
 
         def pixels(elevation_deg: float) -> Complex:
-            level, up = np.cos(np.radians(elevation_deg)), np.sin(np.radians(elevation_deg))
+            level = np.cos(np.radians(elevation_deg))
+            up = np.sin(np.radians(elevation_deg))
             rays = [level * np.cos(azimuth), level * np.sin(azimuth), np.full(len(azimuth), up)]
             seen = camera.lens.project(np.column_stack(rays) @ camera.rotation)
             scaled = (seen + 0.5) * camera.scale - 0.5

@@ -23,7 +23,9 @@ from sfa_localization.data.sphere import Sphere, rotation
 
 _LEAST_AFFINE = 1e-3  # determinant of the affine part: 1 for square pixels, 0 if singular
 _WIDEST_PLANE = 20.0  # radius in the plane of a mirror up to which its distortion is inverted
-_SAMPLES, _NEWTON_STEPS = 2048, 3  # inversion of a curve: interpolated, then refined
+# inversion of a curve: interpolated, then refined
+_SAMPLES = 2048
+_NEWTON_STEPS = 3
 
 
 class Curve(NamedTuple):
@@ -42,7 +44,8 @@ def increasing(f: Callable[[Array], Array], df: Callable[[Array], Array], limit:
     x = x[: falling[0]] if falling.size else x
     if len(x) < 2:
         raise CameraError('the distortion or polynomial does not increase from the center')
-    y, end = f(x), x[-1]
+    y = f(x)
+    end = x[-1]
 
     def value(at: Array) -> Array:
         return np.where(at <= end, f(np.minimum(at, end)), np.nan)
@@ -115,7 +118,8 @@ class RadialLens:
 
     def _shift(self, plane: Array) -> Array:
         """The tangential part of a distortion (N, 2)."""
-        (p1, p2), (x, y) = self.tangential, plane.T
+        (p1, p2) = self.tangential
+        (x, y) = plane.T
         shift_x = 2 * p1 * x * y + p2 * (3 * x**2 + y**2)
         shift_y = p1 * (x**2 + 3 * y**2) + 2 * p2 * x * y
         return np.column_stack([shift_x, shift_y])
@@ -133,7 +137,8 @@ class RadialLens:
         result = np.zeros_like(plane)
         for _ in range(50 if any(self.tangential) else 1):
             radius, direction = _polar(plane - self._shift(result))
-            previous, result = result, self.bend.inverse(radius)[:, None] * direction
+            previous = result
+            result = self.bend.inverse(radius)[:, None] * direction
             if not np.any(np.abs(result - previous) > 1e-13):
                 break
         return result
@@ -335,7 +340,8 @@ def _second(calibration: LensCalibration) -> tuple[RadialLens, Array]:
 
 def _polar_bend(calibration: LensCalibration) -> Curve:
     """The angle from the axis as a linear function of the radius, for uncalibrated cameras."""
-    near, far = calibration.radius_min, calibration.radius_max
+    near = calibration.radius_min
+    far = calibration.radius_max
     if near >= far or calibration.angle_min >= calibration.angle_max:
         raise CameraError('the polar model needs radius_min < radius_max and angle_min < angle_max')
     low, high = np.radians([calibration.angle_min, calibration.angle_max])

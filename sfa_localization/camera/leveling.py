@@ -29,7 +29,8 @@ correlation time of 0.7 s tilts by one degree meanwhile."""
 
 def leaning(roll: float, pitch: float) -> str:
     """The sentence about a camera that leans on the robot by roll and pitch, rad."""
-    aside, along = ('right' if roll > 0 else 'left'), ('forward' if pitch > 0 else 'back')
+    aside = 'right' if roll > 0 else 'left'
+    along = 'forward' if pitch > 0 else 'back'
     return (
         f'the camera leans by {abs(np.degrees(roll)):.1f} degrees to the {aside} and by '
         f'{abs(np.degrees(pitch)):.1f} degrees {along}: the model levels its images'
@@ -126,6 +127,7 @@ def tilts_at(stamps_ns: Stamps, measured_ns: Stamps, tilts: Array) -> Array:
         return np.full((len(stamps_ns), 2), np.nan)
     after = np.searchsorted(measured_ns, stamps_ns).clip(0, len(measured_ns) - 1)
     before = np.maximum(after - 1, 0)
-    since, until = np.abs(measured_ns[before] - stamps_ns), np.abs(measured_ns[after] - stamps_ns)
+    since = np.abs(measured_ns[before] - stamps_ns)
+    until = np.abs(measured_ns[after] - stamps_ns)
     between = np.column_stack([np.interp(stamps_ns, measured_ns, tilt) for tilt in tilts.T])
     return np.where((np.minimum(since, until) <= NEAR_NS)[:, None], between, np.nan)

@@ -75,7 +75,8 @@ class Unwrapper:
         """The lens and its mounting. Raises CameraError where none is described, or its file cannot
         be used.
         """
-        lens, mount_rpy = self._calibration or calibration_of(self.camera), self.camera.mount_rpy
+        lens = self._calibration or calibration_of(self.camera)
+        mount_rpy = self.camera.mount_rpy
         return replace(lens, mount_rpy=mount_rpy) if any(mount_rpy) else lens
 
     @property
@@ -142,7 +143,8 @@ class Unwrapper:
 
     def _resized(self, image: Image) -> Image:
         """A panorama of another size, resized."""
-        height, width = self.panorama.height, self.panorama.width
+        height = self.panorama.height
+        width = self.panorama.width
         shrinks = image.shape[0] > height or image.shape[1] > width
         method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         return np.asarray(cv2.resize(image, (width, height), interpolation=method))

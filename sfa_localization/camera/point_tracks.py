@@ -21,12 +21,24 @@ from sfa_localization.data.sphere import rotation
 Pixels = NDArray[np.float32]
 LONGEST_SIDE = 800
 """Pixels: larger images are shrunk, as more pixels do not make the lens more certain."""
-_STEP_M, _STEP_RAD = 0.08, 0.07  # of the robot between images: less hardly moves points
-_MOST_IMAGES, _STRETCH = 500, 60  # in all, and in a row
-_PATCH, _LEVELS, _ITERATIONS = 19, 3, 30  # of the tracker: points move by up to 75 pixels
+# of the robot between images: less hardly moves points
+_STEP_M = 0.08
+_STEP_RAD = 0.07
+# in all, and in a row
+_MOST_IMAGES = 500
+_STRETCH = 60
+# of the tracker: points move by up to 75 pixels
+_PATCH = 19
+_LEVELS = 3
+_ITERATIONS = 30
 _LARGEST_ERROR_PX = 0.7  # after tracking a point to the next image and back
-_POINTS, _QUALITY, _SPACING_PX = 80, 0.01, 14  # of new corners in an image
-_EVERY, _FEWEST = 6, 60  # new corners every few images, and where few points are left
+# of new corners in an image
+_POINTS = 80
+_QUALITY = 0.01
+_SPACING_PX = 14
+# new corners every few images, and where few points are left
+_EVERY = 6
+_FEWEST = 60
 _LONGEST = 40  # images in which a point is followed: wheels drift meanwhile
 _SHORTEST = 3  # sightings that show more than where a point is
 _TURNING_RAD = 0.02  # a turn that shows in which direction images rotate
@@ -65,7 +77,8 @@ def changing(samples: Sequence[Image]) -> Mask:
     sums = squares = np.zeros(1)
     for sample in samples:
         gray = _gray(sample).astype(float)
-        sums, squares = sums + gray, squares + gray**2
+        sums = sums + gray
+        squares = squares + gray**2
     variance = squares / len(samples) - (sums / len(samples)) ** 2
     change = cv2.GaussianBlur(np.sqrt(np.maximum(variance, 0.0)), (0, 0), 2.0)
     still = cv2.dilate((np.asarray(change) < _CHANGE).astype(np.uint8), np.ones((_PATCH, _PATCH)))
@@ -140,7 +153,8 @@ class PointTracker:
         gray = _gray(image)
         if self._before is not None and self._live:
             self._follow(gray, float(wrap_angle(pose[2] - self._pose[2])))
-        self._before, self._pose = gray, pose
+        self._before = gray
+        self._pose = pose
         self._stamps.append(stamp_ns)
         if len(self._stamps) % _EVERY == 1 or len(self._live) < _FEWEST:
             self._begin(gray)
@@ -148,7 +162,8 @@ class PointTracker:
     def interrupt(self) -> None:
         """End all points: the next image does not follow the last."""
         self._ended += [track for track in self._live if len(track.images) >= _SHORTEST]
-        self._live, self._before = [], None
+        self._live = []
+        self._before = None
 
     def tracks(self) -> Tracks:
         """All points that were seen often enough."""
@@ -188,7 +203,8 @@ class PointTracker:
         flows = [self._flow(gray, *way) for way in ways]
         best = int(np.argmax([fits.sum() for _, fits in flows]))
         self._votes[best] += turns
-        live, number = list[_Track](), len(self._stamps)
+        live = list[_Track]()
+        number = len(self._stamps)
         for track, pixel, fits in zip(self._live, *flows[best], strict=True):
             if fits and len(track.images) < _LONGEST:
                 track.images.append(number)

@@ -14,7 +14,9 @@ from sfa_localization.camera.settings import LensCalibration
 from sfa_localization.data.run import Image
 
 _SIDE_PX = 240  # longer side of the compared images: a rim is found to 1 % of its radius
-_SAMPLES, _EVERY = 12, 10  # compared images, and images between them
+# compared images, and images between them
+_SAMPLES = 12
+_EVERY = 10
 _DIFFERENT = 4.0  # mean difference in gray levels of images of a robot that moves
 _MOVED = 0.05  # of the radius: another crop, zoom, or lens
 
@@ -23,7 +25,8 @@ class RimWatch:
     """Compares the rim in the first images of a robot that moves with that of a lens."""
 
     def __init__(self, lens: LensCalibration) -> None:
-        self.problem, self.done = '', False
+        self.problem = ''
+        self.done = False
         self._lens = lens
         self._samples: list[Image] = []
         self._count = 0

@@ -43,7 +43,8 @@ class PanoramaConfig(Settings):
     @property
     def sphere(self) -> Sphere:
         """The directions of its pixels."""
-        low, high = math.radians(self.elevation_min), math.radians(self.elevation_max)
+        low = math.radians(self.elevation_min)
+        high = math.radians(self.elevation_max)
         return Sphere(low, high, self.clockwise)
 
     def asked_differences(self, asked: PanoramaConfig) -> str:

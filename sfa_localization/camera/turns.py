@@ -17,12 +17,15 @@ from sfa_localization.data.statistics import parabola_peak
 
 Texture = NDArray[np.float32]
 
-_COLUMNS, _ROWS = 200, 10
+_COLUMNS = 200
+_ROWS = 10
 _FEW_COLUMNS = 50  # of the textures that are stored
 _WIDEST = 0.2  # of the panorama: wider structures are light, not landmarks
 # The mean of this many images with correlations below _DIFFERENT shows only constant parts: the
 # robot, a mask.
-_STATIC_MIN, _STATIC_MAX, _DIFFERENT = 8, 64, 0.95
+_STATIC_MIN = 8
+_STATIC_MAX = 64
+_DIFFERENT = 0.95
 # Textures without that mean count where their peak exceeds this many standard deviations. If the
 # robot hardly turns, the mean contains the surroundings, and the rest is noise with a peak of 3.
 _PROMINENT = 3.2
@@ -55,7 +58,9 @@ class VisualGyro:
         """The heading (rad, wrapped, 0 at the first image) after a panorama (H, W, C) uint8."""
         texture = _texture(image)
         if self._before.shape != texture.shape:
-            self._static, self._statics, self._last_static = np.zeros_like(texture), 0, texture
+            self._static = np.zeros_like(texture)
+            self._statics = 0
+            self._last_static = texture
         else:
             shift = _shift(self._before, texture)
             if self._statics >= _STATIC_MIN:
@@ -85,7 +90,8 @@ class VisualGyro:
 
 def _texture(image: Image) -> Texture:
     """Logarithmic brightness (rows, columns) minus its wide running mean around."""
-    height, width = min(image.shape[0], _ROWS), min(image.shape[1], _COLUMNS)
+    height = min(image.shape[0], _ROWS)
+    width = min(image.shape[1], _COLUMNS)
     gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.shape[2] == 3 else image[..., 0]
     small = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
     light = np.log1p(small.astype(np.float32))

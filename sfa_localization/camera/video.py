@@ -25,7 +25,9 @@ AFTER_LOSS = 'video after a lost or damaged packet, before the next key frame'
 _CODECS = {'h264|x264|avc': 'h264', 'h265|x265|hevc': 'hevc'}
 """FFmpeg's decoders by the names of codecs in formats."""
 _OTHERS = 'av1|vp8|vp9|mpeg4'  # a loss would not be noticed in them
-_GAP, _ONLY_PARAMETERS = 'Frame num gap', 'no frame!'  # in FFmpeg's log
+# in FFmpeg's log
+_GAP = 'Frame num gap'
+_ONLY_PARAMETERS = 'no frame!'
 
 
 class ImageReader:
@@ -89,13 +91,15 @@ class _Video:
             import av
         except ImportError:
             raise CameraError(f'{codec} video needs PyAV: pip install av') from None
-        self.codec, self._av = codec, av
+        self.codec = codec
+        self._av = av
         self._decoder: Any = av.CodecContext.create(codec, 'r')
         self._decoder.options = {'err_detect': 'explode'}  # else FFmpeg paints over damage
         self._number = 0
         self._waiting: dict[int, int] = {}
         """Stamps, ns, of the packets whose images have not come out, by number of packet."""
-        self._first, self._why = 1, TOO_EARLY
+        self._first = 1
+        self._why = TOO_EARLY
 
     def add(self, stamp_ns: int, data: bytes) -> list[StampedImage]:
         """The images that are complete with a packet, and errors for those that are lost."""
@@ -111,7 +115,8 @@ class _Video:
 
     def _decode(self, packet: Any) -> list[StampedImage]:
         """The images that are complete with a packet, or with the end."""
-        frames, logging = None, self._av.logging
+        frames = None
+        logging = self._av.logging
         level = logging.get_level()
         logging.set_level(logging.DEBUG)  # only its log tells that a packet of H.264 is missing
         with logging.Capture(local=False) as log, contextlib.suppress(self._av.FFmpegError):
@@ -129,13 +134,17 @@ class _Video:
 
     def _shown(self, frame: Any) -> list[StampedImage]:
         """A frame's image, and errors for those that should have been shown before it."""
-        number, waiting, lost = frame.pts, self._waiting, list[int]()
+        number = frame.pts
+        waiting = self._waiting
+        lost = list[int]()
         if frame.key_frame or not self._decoder.has_b_frames:
             lost = [n for n in waiting if n < number]
-        results, self._why = self._reject(lost, self._why), AFTER_LOSS
+        results = self._reject(lost, self._why)
+        self._why = AFTER_LOSS
         if number in waiting:
             first = min(waiting, key=waiting.__getitem__)
-            stamp_ns, waiting[first] = waiting[first], waiting[number]
+            stamp_ns = waiting[first]
+            waiting[first] = waiting[number]
             del waiting[number]
             results.append((stamp_ns, frame.to_ndarray(format='bgr24')))
         return results

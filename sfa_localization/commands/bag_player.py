@@ -33,7 +33,8 @@ from sfa_localization.commands.settings import PlayConfig
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.rejections import encodable
 
-DEPTH, LATCHED_DEPTH = 10, 100
+DEPTH = 10
+LATCHED_DEPTH = 100
 """Messages in the queue of a publisher, and in the queue that late subscribers receive."""
 SETTLED_S = 0.5  # without a new subscriber, all nodes have started
 CLOCK_PERIOD_S = 0.025  # of /clock, as for `ros2 bag play --clock`
@@ -52,7 +53,8 @@ def play(
     Only the named `topics` are played, all without names. The replay starts when images and
     odometry have subscribers and no more come, or after `config.wait`. Raises BagError.
     """
-    context, played = Context(), Counter[str]()
+    context = Context()
+    played = Counter[str]()
     # args=[]: rclpy cannot read names on the command line that are not UTF-8.
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
@@ -81,7 +83,9 @@ def play(
 
 def _publishers(node: Node, bag: Bag, names: Collection[str]) -> dict[str, Publisher]:
     """A publisher for each topic, or for the named ones; logs which cannot be played, and why."""
-    topics, made, reasons = bag.topics, dict[str, Publisher](), list[str]()
+    topics = bag.topics
+    made = dict[str, Publisher]()
+    reasons = list[str]()
     for name in names or topics:
         if name not in topics:
             choices = ', '.join(sorted(topics))
@@ -115,7 +119,9 @@ def _await_subscribers(
         what: [made for name, made in publishers.items() if bag.topics[name].kind in kind]
         for what, kind in kinds.items()
     }
-    missing, last, changed = list[str](), 0, time.monotonic()
+    missing = list[str]()
+    last = 0
+    changed = time.monotonic()
     end = changed + wait_s
     while (now := time.monotonic()) < end:
         counts = {made: made.get_subscription_count() for made in publishers.values()}
@@ -123,7 +129,8 @@ def _await_subscribers(
             what for what, group in needed.items() if group and not any(map(counts.get, group))
         ]
         if sum(counts.values()) != last:
-            last, changed = sum(counts.values()), now
+            last = sum(counts.values())
+            changed = now
         if last and not missing and now - changed > SETTLED_S:
             return
         time.sleep(0.05)

@@ -80,7 +80,8 @@ def run(arguments: argparse.Namespace) -> int:
     mount_rpy = options.settings(CameraConfig, arguments).mount_rpy
     if any(mount_rpy):
         lens = replace(lens, mount_rpy=mount_rpy)
-    text, images = calibration_files.calibration_text(lens), _images(arguments)
+    text = calibration_files.calibration_text(lens)
+    images = _images(arguments)
     if images:
         panorama = fitting_panorama(PanoramaConfig(), learned) if learned else PanoramaConfig()
         # Also without --check, to prove that the calibration is usable.

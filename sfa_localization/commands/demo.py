@@ -43,7 +43,8 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization.simulation.settings import SimulationConfig
     from sfa_localization.training import Recipe, train
 
-    out, start = arguments.out, time.monotonic()
+    out = arguments.out
+    start = time.monotonic()
     garden = SimulationConfig(world=arguments.world, compression='jpeg')
 
     def announce(step: str) -> None:
@@ -72,7 +73,8 @@ def prepare_folder(out: Path, world: int) -> None:
 
     Bags and an unfinished training are kept. Raises LocalizationError.
     """
-    marker, text = out / MARKER, json.dumps({'world': world, 'version': __version__})
+    marker = out / MARKER
+    text = json.dumps({'world': world, 'version': __version__})
     try:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()) and not (marker.exists() and marker.read_text('utf-8') == text):

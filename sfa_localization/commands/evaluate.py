@@ -58,9 +58,11 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization.place_model import PlaceModel
     from sfa_localization.reports.evaluation import count_lines, judgment, tables, trust_lines
 
-    align, transform = arguments.align, None
+    align = arguments.align
+    transform = None
     if [str(path) for path in align] == ['none']:
-        align, transform = [], RigidTransform(0.0, 0.0, 0.0)
+        align = []
+        transform = RigidTransform(0.0, 0.0, 0.0)
     read = arguments.model, arguments.bag, *align, arguments.config
     if arguments.json:
         options.require_output(arguments.json, read, '.json')
@@ -100,7 +102,8 @@ def _write_report(arguments: argparse.Namespace, result: Evaluation) -> None:
     from sfa_localization.reports.evaluation import worst_of, write_evaluation_page, write_report
     from sfa_localization.reports.page import PAGE, begin_page
 
-    folder, drive = arguments.report, (result.truth, result.estimates, result.scores)
+    folder = arguments.report
+    drive = (result.truth, result.estimates, result.scores)
     begin_page(folder)
     write_report(folder, *drive, result.estimates['sfa'].poses[:, :2], result.features)
     late_ns = round(result.counts.get('camera_delay_s', 0.0) * 1e9)

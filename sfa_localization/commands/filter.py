@@ -46,7 +46,8 @@ def run(arguments: argparse.Namespace) -> int:
     result = filtering.run_filter(odometry, positions, config, progress=True)
     for table in (odometry, positions):
         if table.skipped:
-            count, first = len(table.skipped), table.skipped[0]
+            count = len(table.skipped)
+            first = table.skipped[0]
             which = f'left out, the first is line {first}'
             print(f'{table.source}: {count} rows without a stamp or number {which}')
     for reason, count in sorted(result.counts.items()):

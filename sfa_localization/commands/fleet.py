@@ -56,7 +56,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.workers < 1:
         raise ConfigError('--workers: give 1 or more')
-    output, address, file = arguments.output.resolve(), arguments.scheduler, arguments.json
+    output = arguments.output.resolve()
+    address = arguments.scheduler
+    file = arguments.json
     options.require_report(output, file)
     if file:
         options.require_output(file, [], '.json')
@@ -150,7 +152,8 @@ def _work_on(gardens: Sequence[Garden], place: Place, total: int) -> None:
     from sfa_localization.commands.garden import work
 
     submit, limit = place
-    waiting, refused = deque(gardens), 0
+    waiting = deque(gardens)
+    refused = 0
     running: dict[Future[str], Garden] = {}
     failed: set[Garden] = set()
     with progress_bar('fleet', total, 'gardens', total - len(gardens), visible=True) as bar:

@@ -25,7 +25,9 @@ from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.fleet import STATES
 from sfa_localization.reports.page import BAD, WEAK
 
-CONFIG, POINTS, TESTS = 'localization.yaml', 'points.csv', 'test'
+CONFIG = 'localization.yaml'
+POINTS = 'points.csv'
+TESTS = 'test'
 TRAINING = 'training.json'
 Judgment = Mapping[str, Any]
 """What a command writes as JSON, with a `grade` of STATES and a `sentence`."""
@@ -85,7 +87,8 @@ class Garden:
     def write(self, result: Mapping[str, Any], judgments: Sequence[Judgment]) -> str:
         """Write a result with judgments, the worst first; the state. Raises LocalizationError."""
         ordered = sorted(judgments, key=lambda judgment: [*STATES].index(judgment['grade']))
-        grade, sentences = ordered[0]['grade'], [judgment['sentence'] for judgment in ordered]
+        grade = ordered[0]['grade']
+        sentences = [judgment['sentence'] for judgment in ordered]
         head = {'garden': self.output.name, 'grade': grade, 'state': STATES[grade]}
         write_json(self.output / 'result.json', {**result, **head, 'sentences': sentences})
         return STATES[grade]
@@ -104,7 +107,8 @@ def work(garden: Garden) -> str:
 
     A LocalizationError is a result; any other error is raised, and no result is written.
     """
-    result, inputs = garden.result(), garden.inputs()
+    result = garden.result()
+    inputs = garden.inputs()
     with redirect_stdout(StringIO()) as output, redirect_stderr(output):
         try:
             training, *updates = _learn(garden, result, inputs)
@@ -134,7 +138,8 @@ def _learn(garden: Garden, before: Mapping[str, Any], inputs: Mapping[str, Any])
 
     Returns the judgments of the training, which may be that of an earlier run, and of each update.
     """
-    old, config = before.get('inputs', {}), garden.option('--config', CONFIG)
+    old = before.get('inputs', {})
+    config = garden.option('--config', CONFIG)
     changes = {name for name in {*old, *inputs} if old.get(name) != inputs.get(name)}
     changed, former = ({Path(name).parts[0] for name in names} for names in (changes, old))
     added = [drive for drive in garden.bags() if drive.name in changed - former]
@@ -148,7 +153,8 @@ def _learn(garden: Garden, before: Mapping[str, Any], inputs: Mapping[str, Any])
 
 def _train(garden: Garden, config: Sequence[Path | str]) -> Judgment:
     """Inspect and train, with a page of each."""
-    drives, output = garden.bags(), garden.output
+    drives = garden.bags()
+    output = garden.output
     if not drives:
         problem = 'holds no bag' if garden.folder.is_dir() else 'is no folder'
         raise BagError(f'{garden.folder}: {problem}: record a bag into it')
@@ -167,7 +173,8 @@ def _evaluate(garden: Garden, has_points: bool) -> list[Judgment]:
 
     The map is aligned by measured points, or on the drives of the training.
     """
-    words, judgments = garden.option('--config', CONFIG), list[Judgment]()
+    words = garden.option('--config', CONFIG)
+    judgments = list[Judgment]()
     for drive in ['none'] if has_points else garden.bags():
         words += ['--align', drive]
     for bag in garden.bags(TESTS):

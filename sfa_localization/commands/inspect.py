@@ -85,10 +85,12 @@ def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:
     begin_page(folder)
     sections = []
     for number, report in enumerate(reports):
-        stem, figures = Path(report.path).stem, dict[Path, str]()
+        stem = Path(report.path).stem
+        figures = dict[Path, str]()
         file = f'{number}_{stem}' if len(reports) > 1 else stem
         if report.odometry is not None:
-            target, title = folder / f'{file}_path.png', f'{stem}: {report.facts["drive"]}'
+            target = folder / f'{file}_path.png'
+            title = f'{stem}: {report.facts["drive"]}'
             write_path(
                 report.odometry.poses, report.places, title.replace(', along', ',\nalong'), target
             )

@@ -65,7 +65,8 @@ class Recorder:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self.poses: dict[str, list[tuple[int, Array]]] = {name: [] for name in POSES}
-        self.last_s, self.state = time.monotonic(), ''
+        self.last_s = time.monotonic()
+        self.state = ''
         for topic, kind, keep in (
             (POSES['sfa_node'], PoseWithCovarianceStamped, self._keep_pose),
             (POSES['ekf_node'], Odometry, self._keep_odometry),
@@ -117,7 +118,8 @@ class Processes:
     """Context manager of programs with log files; on its exit all have ended."""
 
     def __init__(self, folder: Path, stop_timeout_s: float = STOP_S) -> None:
-        self._folder, self._stop_timeout_s = folder, stop_timeout_s
+        self._folder = folder
+        self._stop_timeout_s = stop_timeout_s
         self._running: dict[str, Popen[bytes]] = {}
         folder.mkdir(parents=True, exist_ok=True)
 
@@ -196,7 +198,8 @@ def run_live(programs: Mapping[str, Sequence[str]], folder: Path) -> Live:
         while not processes.ended(PLAYER):
             recorder.spin(0.2)
             processes.require_alive(NODES)
-        ended_s, state = time.monotonic(), recorder.state
+        ended_s = time.monotonic()
+        state = recorder.state
         while (now_s := time.monotonic()) < ended_s + STOP_S:
             if now_s - max(recorder.last_s, ended_s) > SETTLE_S:
                 break

@@ -17,7 +17,9 @@ WRITES = 'MAP.yaml and MAP.pgm, which nav2_map_server reads'
 EXAMPLES = """\
   map garden.npz --output garden.yaml
   map garden.npz --output garden.yaml --width 0.6"""
-_FREE, _UNKNOWN = 254, 205  # gray levels of map_saver: the second is occupied by 0.19608
+# gray levels of map_saver: the second is occupied by 0.19608
+_FREE = 254
+_UNKNOWN = 205
 _YAML = """\
 image: {image}
 mode: trinary
@@ -40,12 +42,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Write both files: free where the robot drove in training, unknown elsewhere."""
     from sfa_localization.place_model import PlaceModel
 
-    output, image = arguments.output, arguments.output.with_suffix('.pgm')
+    output = arguments.output
+    image = arguments.output.with_suffix('.pgm')
     options.require_output(output, [arguments.model], '.yaml')
     options.require_output(image, [arguments.model], '.pgm')
     config = options.settings(GroundConfig, arguments)
     cells = PlaceModel.load(arguments.model).ground.cells(config)
-    (height, width), (x, y) = cells.driven.shape, cells.corner
+    (height, width) = cells.driven.shape
+    (x, y) = cells.corner
     gray = np.where(cells.driven[::-1], _FREE, _UNKNOWN).astype(np.uint8)
     with atomic_write(image) as file:
         file.write(f'P5\n{width} {height}\n255\n'.encode() + gray.tobytes())

@@ -68,7 +68,8 @@ def require_report(folder: Path | None, other: Path | None) -> None:
             if file.suffix.lower() in REPORT_FILES and first_bytes(file):
                 raise LocalizationError(f'{file}: is no report: give --report another folder')
     if other is not None:
-        place, file = resolved(folder), resolved(other)
+        place = resolved(folder)
+        file = resolved(other)
         in_report = file.parent == place and file.suffix.lower() in REPORT_FILES
         if in_report or file in (place, *place.parents):
             raise LocalizationError(f'{other}: named for two outputs: give each its own')
@@ -142,7 +143,8 @@ def recipe(arguments: argparse.Namespace) -> Recipe:
     """Return the training recipe of --config and of the command line."""
     from sfa_localization.training import Recipe
 
-    default, chosen = Recipe(), {}
+    default = Recipe()
+    chosen = {}
     for item in dataclasses.fields(Recipe):
         group = getattr(default, item.name)
         if isinstance(group, Settings):

@@ -145,7 +145,8 @@ def _lens_picture(bag: Path, trained: Trained, used: Recipe) -> bytes:
     from sfa_localization.camera.encodings import encode_png
     from sfa_localization.camera.panorama import Unwrapper
 
-    model, run = trained.model, trained.runs[0]
+    model = trained.model
+    run = trained.runs[0]
     if model.lens is None or trained.lens is None:
         return b''
     middle = int(run.panoramas.stamps_ns[len(run.panoramas) // 2])

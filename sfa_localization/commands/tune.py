@@ -41,15 +41,20 @@ def run(arguments: argparse.Namespace) -> int:
     options.require_new(arguments.output)
     config = options.settings(FilterConfig, arguments)
     changes = load_changes(arguments.config) if arguments.config else {}
-    model, grid = PlaceModel.load(arguments.model), arguments.method == 'grid'
+    model = PlaceModel.load(arguments.model)
+    grid = arguments.method == 'grid'
     options.require_same_panorama(arguments.config, model.panorama)
-    reading, watch = options.recipe(arguments), options.settings(WatchConfig, arguments)
-    search, cost = tuning.tune_by_likelihood, tuning.likelihood_cost
+    reading = options.recipe(arguments)
+    watch = options.settings(WatchConfig, arguments)
+    search = tuning.tune_by_likelihood
+    cost = tuning.likelihood_cost
     if grid:
-        search, cost = tuning.tune_by_grid, tuning.error_cost
+        search = tuning.tune_by_grid
+        cost = tuning.error_cost
     drives = [tuning.read_drive(bag, model, reading, watch, grid) for bag in arguments.bags]
     best = search(drives, config)
-    before, after = asdict(config), asdict(best)
+    before = asdict(config)
+    after = asdict(best)
     tuned = {name: value for name, value in after.items() if value != before[name]}
     changes.setdefault('ekf_node', {}).update(tuned)
     write_config(arguments.output, changes)

@@ -19,7 +19,8 @@ from sfa_localization.data.files import absence, atomic_write
 from sfa_localization.data.rejections import short_line
 
 Arrays = dict[str, NDArray[Any]]
-_HEADER, _CHECKSUM = 'header', 'sha256'
+_HEADER = 'header'
+_CHECKSUM = 'sha256'
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

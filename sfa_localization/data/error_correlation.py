@@ -68,7 +68,8 @@ class ErrorCorrelation:
     def alike(self, driven_m: Array) -> Array:
         """Sums (M,) of the correlations of each error with all, of images at `driven_m` (M,)."""
         order = np.argsort(driven_m, kind='stable')
-        path, total = driven_m[order], np.ones(len(driven_m))
+        path = driven_m[order]
+        total = np.ones(len(driven_m))
         for lag in range(1, len(path)):
             spacing = path[lag:] - path[:-lag]
             if spacing.min() > _FARTHEST_M:
@@ -90,7 +91,8 @@ def _standardized(errors: Array, variances: Array) -> Array:
 
 def _pairs(ratio: Array, driven_m: Array, owner: NDArray[np.int64]) -> tuple[Array, Array]:
     """Distance and mean product of all pairs inside a segment and nearer than _FARTHEST_M."""
-    spacing, product = [np.zeros(0)], [np.zeros(0)]
+    spacing = [np.zeros(0)]
+    product = [np.zeros(0)]
     for lag in range(1, len(ratio)):
         distance = driven_m[lag:] - driven_m[:-lag]
         near = (owner[lag:] == owner[:-lag]) & (distance < _FARTHEST_M)
@@ -103,12 +105,14 @@ def _pairs(ratio: Array, driven_m: Array, owner: NDArray[np.int64]) -> tuple[Arr
 
 def _exponential(distance: Array, correlation: Array, weight: Array) -> tuple[float, float]:
     """Share and distance of the exponential nearest to a correlation (B,), by least squares."""
-    least, best = math.inf, (0.0, 1.0)
+    least = math.inf
+    best = (0.0, 1.0)
     for length in _DISTANCES_M:
         shape = np.exp(-distance / length)
         share = float((weight * correlation) @ shape / ((weight * shape) @ shape))
         share = min(max(share, 0.0), LARGEST_SHARE)
         residual = float(weight @ (correlation - share * shape) ** 2)
         if residual < least - 1e-12:
-            least, best = residual, (share, float(length))
+            least = residual
+            best = (share, float(length))
     return best

@@ -32,7 +32,8 @@ def clock_difference(ahead_ns: float, topic: str = 'images', odometry: str = 'od
     """How far a topic is stamped ahead of the odometry, and which of them may be in another time
     scale, in words.
     """
-    seconds, where = abs(ahead_ns) * 1e-9, 'ahead of' if ahead_ns > 0 else 'behind'
+    seconds = abs(ahead_ns) * 1e-9
+    where = 'ahead of' if ahead_ns > 0 else 'behind'
     scale = LEAP_SECONDS.get(round(seconds))
     reason = f' ({topic if ahead_ns > 0 else odometry} in {scale}?)' if scale else ''
     return f'stamped {seconds:.1f} s {where} the odometry{reason}'

@@ -30,14 +30,17 @@ def wrap_angle(angle_rad: Array | float) -> Array:
 
 def rotation(yaw_rad: float) -> Array:
     """Rotation matrix (2, 2) of a counterclockwise rotation."""
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    c = np.cos(yaw_rad)
+    s = np.sin(yaw_rad)
     return np.array([[c, -s], [s, c]])
 
 
 def compose(a: Array, b: Array) -> Array:
     """Pose `b`, given in the frame of pose `a`, expressed in a's parent frame; (..., 3) each."""
-    a, b = np.asarray(a, float), np.asarray(b, float)
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    a = np.asarray(a, float)
+    b = np.asarray(b, float)
+    c = np.cos(a[..., 2])
+    s = np.sin(a[..., 2])
     x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
     y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
     return np.stack([x, y, wrap_angle(a[..., 2] + b[..., 2])], axis=-1)
@@ -46,8 +49,10 @@ def compose(a: Array, b: Array) -> Array:
 def relative(a: Array, b: Array) -> Array:
     """Pose of `b` seen from `a`; (..., 3) each."""
     a, step = np.asarray(a, float), np.asarray(b, float) - a
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    x, y = c * step[..., 0] + s * step[..., 1], c * step[..., 1] - s * step[..., 0]
+    c = np.cos(a[..., 2])
+    s = np.sin(a[..., 2])
+    x = c * step[..., 0] + s * step[..., 1]
+    y = c * step[..., 1] - s * step[..., 0]
     return np.stack([x, y, wrap_angle(step[..., 2])], axis=-1)
 
 
@@ -78,7 +83,8 @@ def align(source: Array, target: Array) -> RigidTransform:
 
     Both (N, 2), N >= 2. Raises DataError for fewer points or mismatched shapes.
     """
-    source, target = np.asarray(source, float), np.asarray(target, float)
+    source = np.asarray(source, float)
+    target = np.asarray(target, float)
     if source.shape != target.shape or source.ndim != 2 or len(source) < 2:
         raise DataError(f'cannot align points of shapes {source.shape} and {target.shape}')
     turn, shift = align_complex(source @ np.array([1.0, 1j]), target @ np.array([1.0, 1j]))
@@ -92,7 +98,8 @@ def align_complex(
 
     Minimizes squared distances, with `weights` (N,). Points without extent are not turned.
     """
-    a, b = np.average(source, weights=weights), np.average(target, weights=weights)
+    a = np.average(source, weights=weights)
+    b = np.average(target, weights=weights)
     products = np.conj(source - a) * (target - b)
     product = complex(np.sum(products if weights is None else weights * products))
     turn = product / abs(product) if product != 0 else 1.0 + 0.0j

@@ -44,13 +44,15 @@ def read_stamp(stamp: Any) -> int:
 def read_yaw(q: Any) -> float:
     """Heading of a Quaternion of any length above _SHORTEST_QUATERNION."""
     norm = _length(q)
-    sine, cosine = q.w * q.z + q.x * q.y, norm * norm / 2 - (q.y * q.y + q.z * q.z)
+    sine = q.w * q.z + q.x * q.y
+    cosine = norm * norm / 2 - (q.y * q.y + q.z * q.z)
     return math.atan2(sine, cosine)
 
 
 def read_planar(position: Any, orientation: Any) -> tuple[float, float, float]:
     """Pose in the plane of a position (or translation) and a Quaternion."""
-    x, y = float(position.x), float(position.y)
+    x = float(position.x)
+    y = float(position.y)
     require_sane('pose', x, y)
     return x, y, read_yaw(orientation)
 
@@ -68,8 +70,10 @@ def read_odometry(
 
 def read_twist(message: Any) -> tuple[float, float, float, float]:
     """v m/s and omega rad/s of an Odometry, and their variances, 0 if unknown."""
-    twist, covariance = message.twist.twist, message.twist.covariance
-    v, omega = float(twist.linear.x), float(twist.angular.z)
+    twist = message.twist.twist
+    covariance = message.twist.covariance
+    v = float(twist.linear.x)
+    omega = float(twist.angular.z)
     require_sane('twist', v, omega)
     return v, omega, _variance(covariance[0]), _variance(covariance[35])
 
@@ -89,7 +93,10 @@ def read_tilt(message: Any) -> tuple[float, float]:
         raise MessageError('no orientation (a node such as imu_filter_madgwick estimates it)')
     q = message.orientation
     norm = _length(q)
-    x, y, z, w = q.x / norm, q.y / norm, q.z / norm, q.w / norm
+    x = q.x / norm
+    y = q.y / norm
+    z = q.z / norm
+    w = q.w / norm
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
     if max(abs(roll), abs(pitch)) > _STEEPEST:

@@ -22,12 +22,15 @@ from sfa_localization.data.geometry import Array, Mask
 
 JUMP = 0.05
 """m or rad by which quantized and rounded poses may miss any speed."""
-ACCELERATION, RAMP_S = 5.0, 0.2
+ACCELERATION = 5.0
+RAMP_S = 0.2
 """Change of speed (m/s^2, rad/s^2) that wheels on the ground reach, and the time for which it may
 act within a step: longer ramps appear in the speeds before and after."""
 NOISE = 6.0
 """Standard deviations of the odometry's noise that a break exceeds as well."""
-NOISE_START, _NOISE_LEAST, _LEARNING = 0.01, 1e-3, 0.1
+NOISE_START = 0.01
+_NOISE_LEAST = 1e-3
+_LEARNING = 0.1
 """m or rad: this noise before any message, and the least; relative change of it per message."""
 RETURN_S = 0.5
 """Messages of a path pause for less: a driver that fails for longer breaks the path."""
@@ -37,7 +40,8 @@ UNTURNED_RAD = 0.2
 """An orientation that is constant while the twist turns by this is not filled."""
 FIRST_SPEED = 2.0
 """m/s at most of a robot that starts, where no twist says its speed."""
-IN_TURN, _MEMORY = 0.1, 50
+IN_TURN = 0.1
+_MEMORY = 50
 """Share, among so many messages, of changes between two paths that move: 1 of two publishers that
 alternate, 0.2 where one is nine times as fast, 0 of single faults, whose pose stands."""
 
@@ -49,7 +53,8 @@ def beyond(step: ArrayLike, seconds: ArrayLike, speeds: Sequence[ArrayLike]) -> 
     before. `seconds` (...) is the longest time that a step may have taken: a robot may stop within
     it, and stamps may be late.
     """
-    moved, longest_s = np.asarray(step, float), np.asarray(seconds, float)[..., None]
+    moved = np.asarray(step, float)
+    longest_s = np.asarray(seconds, float)[..., None]
     distances = []
     for each in speeds:
         speed = np.asarray(each, float)
@@ -96,8 +101,10 @@ class Paths:
     def __init__(self, noise: float = NOISE_START) -> None:
         self._ends: list[_Message] = []  # of the paths; that of the last message comes last
         self._fills_twist = False
-        self._messages, self._returned = 0, -1
-        self.noise, self._share = noise, 0.0
+        self._messages = 0
+        self._returned = -1
+        self.noise = noise
+        self._share = 0.0
         self.aside = 0
         """Number of messages that the last one shows to be beside its path."""
 
@@ -111,7 +118,8 @@ class Paths:
         ends = [end for end in self._ends if seconds - end.seconds < RETURN_S]
         self._fills_twist |= bool(v or omega)
         message = _Message(self._messages, self._messages, seconds, pose, (v, omega), seconds)
-        self._messages, self.aside = self._messages + 1, 0
+        self._messages = self._messages + 1
+        self.aside = 0
         for end in reversed(ends):
             distance = _distance(end, message, self._fills_twist)
             if distance <= tolerance(seconds - end.seconds, self.noise):
@@ -147,14 +155,17 @@ def _between(end: _Message, message: _Message) -> tuple[float, float]:
 def _distance(end: _Message, message: _Message, fills_twist: bool) -> float:
     """How far a message, m or rad, is `beyond` the speeds from the end of a path: those of twists,
     or without any that between its last poses."""
-    longest_s, twists = message.seconds - end.renewed_s + _STALE_S, (end.twist, message.twist)
+    longest_s = message.seconds - end.renewed_s + _STALE_S
+    twists = (end.twist, message.twist)
     if fills_twist:
         longest_s = message.seconds - end.seconds + _STALE_S
     elif end.twist == (0.0, 0.0):
         dx, dy = (b - a for a, b in zip(end.pose[:2], message.pose[:2], strict=True))
         return max(math.hypot(dx, dy) - FIRST_SPEED * longest_s, 0.0)
     dx, dy, turn = (b - a for a, b in zip(end.pose, message.pose, strict=True))
-    c, s, turn = math.cos(end.pose[2]), math.sin(end.pose[2]), math.remainder(turn, math.tau)
+    c = math.cos(end.pose[2])
+    s = math.sin(end.pose[2])
+    turn = math.remainder(turn, math.tau)
 
     def missed(step: float, speed: float) -> float:
         return step - sorted((0.0, step, speed * longest_s))[1]
@@ -168,7 +179,10 @@ class Orientation:
     turns."""
 
     def __init__(self) -> None:
-        self._seconds, self._yaw, self._changes, self._turned = 0.0, math.nan, 0, 0.0
+        self._seconds = 0.0
+        self._yaw = math.nan
+        self._changes = 0
+        self._turned = 0.0
 
     @property
     def is_filled(self) -> bool:
@@ -179,7 +193,8 @@ class Orientation:
         """Take the next message."""
         self._changes += yaw != self._yaw  # also the first one
         self._turned += abs(omega) * sorted((0.0, seconds - self._seconds, RETURN_S))[1]
-        self._seconds, self._yaw = seconds, yaw
+        self._seconds = seconds
+        self._yaw = yaw
 
 
 def beside(seconds: Array, poses: Array, twists: Array) -> tuple[Mask, float]:
@@ -188,11 +203,14 @@ def beside(seconds: Array, poses: Array, twists: Array) -> tuple[Mask, float]:
 
     `seconds` (N,) increase; `poses` (N, 3) are x m, y m, yaw rad, `twists` (N, 2) m/s and rad/s.
     """
-    aside, path, noise = np.zeros(len(poses), bool), np.zeros(len(poses), np.int64), NOISE_START
+    aside = np.zeros(len(poses), bool)
+    path = np.zeros(len(poses), np.int64)
+    noise = NOISE_START
     if not len(poses):
         return aside, 0.0
     for _ in range(2):  # the first time shows the noise
-        paths, in_turn = Paths(noise), 0
+        paths = Paths(noise)
+        in_turn = 0
         messages = zip(seconds.tolist(), poses.tolist(), *twists.T.tolist(), strict=True)
         for k, message in enumerate(messages):
             path[k] = paths.add(*message)

@@ -50,7 +50,8 @@ def _check_events(text: str, first: bool) -> None:
             continue
         problem = ''
         if levels:
-            keys, levels[-1][1] = levels[-1][0], levels[-1][1] + 1
+            keys = levels[-1][0]
+            levels[-1][1] = levels[-1][1] + 1
             if keys is not None and levels[-1][1] % 2 and isinstance(event, yaml.ScalarEvent):
                 if event.value in keys and event.value != '<<':  # merges any number of mappings
                     problem = f'it has the key {event.value[:100]!r} twice'

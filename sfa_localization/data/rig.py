@@ -99,7 +99,8 @@ class Rig:
         also displaced the labels of training, by the mean `facing` of exp(i yaw) of the matched
         keyframes: at the heading of training it cancels.
         """
-        lever, turn = self.lever, float(pose[2] - self.camera_yaw.value)
+        lever = self.lever
+        turn = float(pose[2] - self.camera_yaw.value)
         variance = float(covariance[2, 2]) + self.camera_yaw.std**2
         mean_turn = np.exp(1j * turn - variance / 2)
         across = -1j * lever * mean_turn
@@ -113,7 +114,8 @@ class Rig:
         labels = facing * np.exp(-1j * self.camera_yaw.value)
         lever_variance = (self.camera_ahead.std**2 + self.camera_left.std**2) / 2
         base[:2, :2] += (along + lever_variance * abs(labels - mean_turn) ** 2) * np.eye(2)
-        x, y = pose[0] - (lever * mean_turn).real, pose[1] - (lever * mean_turn).imag
+        x = pose[0] - (lever * mean_turn).real
+        y = pose[1] - (lever * mean_turn).imag
         return np.array([x, y, wrap_angle(turn)]), base
 
     def centers(self, poses: Array) -> Array:
@@ -129,8 +131,11 @@ class Rig:
 
     def as_text(self) -> list[str]:
         """Lines for a terminal."""
-        turned, delay = self.camera_yaw, self.camera_delay
-        scale, loss, turn = self.wheel_scale, self.turn_loss, self.turn_factor
+        turned = self.camera_yaw
+        delay = self.camera_delay
+        scale = self.wheel_scale
+        loss = self.turn_loss
+        turn = self.turn_factor
         ahead = _offset(self.camera_ahead, 'ahead of', 'behind')
         aside = _offset(self.camera_left, 'left of', 'right of')
         lines = [f'camera: {ahead} and {aside} base_link']

@@ -45,7 +45,8 @@ class Trajectory:
         after = np.searchsorted(self.stamps_ns, stamps_ns, side='left')
         inside = (before >= 0) & (after < len(self))
         before, after = np.clip([before, after], 0, len(self) - 1)
-        since, until = stamps_ns - self.stamps_ns[before], self.stamps_ns[after] - stamps_ns
+        since = stamps_ns - self.stamps_ns[before]
+        until = self.stamps_ns[after] - stamps_ns
         return np.asarray(
             inside & ((tolerance_ns <= 0) | (np.maximum(since, until) <= tolerance_ns))
         )
@@ -192,9 +193,11 @@ class PanoramaArray:
         # Mapped pages would count as memory that grows with the bag; preadv is safe in threads,
         # and reads at most 2 GiB.
         images = np.empty((max(min(stop, len(self)) - start, 0), *self.shape), np.uint8)
-        rest, offset = memoryview(images.reshape(-1)), start * int(np.prod(self.shape))
+        rest = memoryview(images.reshape(-1))
+        offset = start * int(np.prod(self.shape))
         while rest and (read := os.preadv(self.file.fileno(), [rest], offset)):
-            rest, offset = rest[read:], offset + read
+            rest = rest[read:]
+            offset = offset + read
         return images
 
     def batches(self, size: int) -> Iterator[Image]:
@@ -244,7 +247,8 @@ def differences(stamps_ns: Stamps, poses: Array) -> Array:
     """Twists (N, 2) that lead to each pose (N, 3) from the previous; the first is repeated."""
     if len(poses) < 2:
         return np.zeros((len(poses), 2))
-    step, seconds = relative(poses[:-1], poses[1:]), np.diff(stamps_ns) * 1e-9
+    step = relative(poses[:-1], poses[1:])
+    seconds = np.diff(stamps_ns) * 1e-9
     arc = np.hypot(step[:, 0], step[:, 1]) / np.sinc(step[:, 2] / 2 / np.pi)
     bearing = np.arctan2(step[:, 1], step[:, 0]) - step[:, 2] / 2
     twists = np.stack([arc * np.sign(np.cos(bearing)), step[:, 2]], -1) / seconds[:, None]

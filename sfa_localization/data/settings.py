@@ -105,7 +105,9 @@ def _converted(where: str, default: Any, value: Any) -> Any:
 
 
 def _check_bounds(where: str, metadata: Mapping[str, Any], value: Any) -> None:
-    choices, low, high = metadata['choices'], metadata['low'], metadata['high']
+    choices = metadata['choices']
+    low = metadata['low']
+    high = metadata['high']
     if choices and value not in choices:
         names = ', '.join(filter(None, choices))
         raise ConfigError(f'{where}: {quoted(value)} is not one of {names}')

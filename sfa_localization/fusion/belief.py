@@ -20,10 +20,14 @@ Pose = tuple[float, float, float]
 """x m, y m, yaw rad."""
 Knot = tuple[int, float, float, float]
 """Stamp ns, x m, y m, yaw rad by dead reckoning."""
-SPACING_M, SPACING_RAD, LATEST, CAPACITY = 0.5, 0.2, 30, 60
+SPACING_M = 0.5
+SPACING_RAD = 0.2
+LATEST = 30
+CAPACITY = 60
 """An image that shows less motion than this is not new: neighboring images err alike. All of the
 LATEST images are kept, of older ones those that are new, CAPACITY in all."""
-REACH_M, REACH_STDS = 12.0, 30.0
+REACH_M = 12.0
+REACH_STDS = 30.0
 """Images farther behind, in m and in standard deviations of the newest, are forgotten: there the
 odometry has drifted."""
 LONGEST_DELAY_S = 10.0
@@ -160,7 +164,8 @@ class Columns:
         self.place = np.array([fix.place for fix in fixes])
         rows = [(*f.dead_reckoned, f.yaw, f.variance, f.yaw_variance, f.traveled_m) for f in fixes]
         x, y, self.path_yaw, yaw, self.variance, self.yaw_variance, traveled_m = np.array(rows).T
-        self.path, self.behind_m = x - x[-1] + 1j * (y - y[-1]), traveled_m[-1] - traveled_m
+        self.path = x - x[-1] + 1j * (y - y[-1])
+        self.behind_m = traveled_m[-1] - traveled_m
         self.has_yaw: NDArray[np.bool_] = np.isfinite(yaw)
         self.yaw = np.where(self.has_yaw, yaw, 0.0)
         self.drift = (ODOMETRY_DRIFT * self.behind_m) ** 2
@@ -176,7 +181,8 @@ class DrivenPath(NamedTuple):
 
     def driven(self, stamp_ns: int, pose: Pose, oldest_ns: int) -> DrivenPath:
         """With the pose that dead reckoning leads to; what is older than `oldest_ns` goes."""
-        knots, knot = self.knots, (stamp_ns, *pose)
+        knots = self.knots
+        knot = (stamp_ns, *pose)
         if knots and 0 <= stamp_ns - knots[-1][0] < _KNOT_NS:
             return self
         if len(knots) > 1 and knots[-1][1:] == pose == knots[-2][1:]:
@@ -230,7 +236,8 @@ class Belief(NamedTuple):
         """
         if not self.located:
             return None
-        covariance, update = symmetric(self.covariance), self.memory.update
+        covariance = symmetric(self.covariance)
+        update = self.memory.update
         if self.memory.rejected >= ENOUGH_IMAGES and update and update.innovation is not None:
             squares = np.square(update.innovation / DOUBT_STDS)
             covariance[[0, 1], [0, 1]] += squares[:2].sum()

@@ -31,21 +31,30 @@ SIGNIFICANT_STDS = 2.5
 """Standard deviations that a delay must exceed before it is compensated."""
 _STEP_S = 0.02
 _GRID = np.arange(-round(CLOCK_RANGE_S / _STEP_S), round(CLOCK_RANGE_S / _STEP_S) + 1) * _STEP_S
-_PAIR_NS, _PAUSE_NS = 1_000_000_000, 500_000_000  # pairs with longer ones between are left out
+# pairs with longer ones between are left out
+_PAIR_NS = 1_000_000_000
+_PAUSE_NS = 500_000_000
 # An estimate applies to images stamped so much later, whichever message came first.
-_IN_TRANSIT_NS, _REMEMBERED_NS = 1_000_000_000, 10_000_000_000
+_IN_TRANSIT_NS = 1_000_000_000
+_REMEMBERED_NS = 10_000_000_000
 _FACTORS: Array = np.exp(np.linspace(-0.75, 0.75, 11))
 """True over counted turns: tracks skid, by half at most."""
 _SIGNED: Array = np.concatenate([_FACTORS, -_FACTORS])[:, None]  # columns may grow either way
 _WINDOW_NS = round(CLOCK_RANGE_S * 1e9) + 100_000_000
 # Residuals beyond _OUTLIER times _SCALE_RAD are mismatches, and clipped; delays whose costs differ
 # by less than _ALIKE fit equally well.
-_SCALE_RAD, _OUTLIER, _ALIKE = 0.05, 4.0, 1.0
+_SCALE_RAD = 0.05
+_OUTLIER = 4.0
+_ALIKE = 1.0
 # Smaller turns, rad, and fewer do not show how well images and odometry agree.
-_TURN_RAD, _TURNS_MIN = 0.05, 10
+_TURN_RAD = 0.05
+_TURNS_MIN = 10
 # Neighboring pairs err alike: on a slow curve, things near the camera look like turns for seconds.
-_CAUTION, _SCALE_MIN_RAD, _STD_MAX_S = 4.0, 1e-3, 0.06
-_FAR_NS, _ARRIVALS = 2 * _WINDOW_NS, 10
+_CAUTION = 4.0
+_SCALE_MIN_RAD = 1e-3
+_STD_MAX_S = 0.06
+_FAR_NS = 2 * _WINDOW_NS
+_ARRIVALS = 10
 """What arrives so far ahead, or behind, is of another clock, if so many images in a row are."""
 _MEAN_OF_NORMAL = 0.798  # of |x|: sqrt(2 / pi)
 
@@ -125,7 +134,8 @@ class CameraClockFinder:
     def add_heading(self, stamp_ns: int, yaw_rad: float) -> None:
         """Take the heading that a `VisualGyro` has added up at an image's stamp."""
         if self._last is not None:
-            span_ns, turn = stamp_ns - self._last[0], float(wrap_angle(yaw_rad - self._last[1]))
+            span_ns = stamp_ns - self._last[0]
+            turn = float(wrap_angle(yaw_rad - self._last[1]))
             if 0 <= span_ns < NEAR_NS:
                 return
             if 0 < span_ns < _PAIR_NS:
@@ -134,17 +144,21 @@ class CameraClockFinder:
 
     def _compare(self, start_ns: int, stop_ns: int, turn: float) -> None:
         """Add a pair of images to all sums, once odometry surrounds it by any delay."""
-        first, last = start_ns - _WINDOW_NS, stop_ns + _WINDOW_NS
+        first = start_ns - _WINDOW_NS
+        last = stop_ns + _WINDOW_NS
         stamps_ns, yaw = map(np.array, zip(*self._driven, strict=True))
         pauses_ns = stamps_ns[1:][np.diff(stamps_ns) > _PAUSE_NS]
         if first < stamps_ns[0] or np.any((first <= pauses_ns) & (pauses_ns <= last)):
             return
-        seconds, span = (stamps_ns - start_ns) * 1e-9, (stop_ns - start_ns) * 1e-9
+        seconds = (stamps_ns - start_ns) * 1e-9
+        span = (stop_ns - start_ns) * 1e-9
         counted = np.interp(span - _GRID, seconds, yaw) - np.interp(-_GRID, seconds, yaw)
         driven = _SIGNED * counted
         signed = np.asarray(wrap_angle(turn - driven)) / _SCALE_RAD
-        residual, turning = np.abs(signed), np.abs(driven) > _TURN_RAD
-        limited, near = np.minimum(residual, _OUTLIER), residual < _OUTLIER
+        residual = np.abs(signed)
+        turning = np.abs(driven) > _TURN_RAD
+        limited = np.minimum(residual, _OUTLIER)
+        near = residual < _OUTLIER
         for total, new in (
             (self._cost, limited),
             # The derivative of a turn by the delay is the difference of the turn rates at its ends.
@@ -157,7 +171,8 @@ class CameraClockFinder:
         ):
             total *= self._keep
             total += new
-        estimate, start = self._estimate(), self._start
+        estimate = self._estimate()
+        start = self._start
         if estimate.is_estimated:
             agrees = abs(estimate.delay_s - start.delay_s) <= SIGNIFICANT_STDS * estimate.std_s
             if start.assumed and agrees:
@@ -198,7 +213,8 @@ class ImageClock:
     """
 
     def __init__(self, memory: float) -> None:
-        self.offset_ns, self._memory = 0, memory
+        self.offset_ns = 0
+        self._memory = memory
         self._ahead_ns: deque[int] = deque(maxlen=_ARRIVALS)
         self._supposed: tuple[int, CameraClockFinder] | None = None
 
@@ -226,7 +242,8 @@ class ImageClock:
         finder.add_heading(stamp_ns - offset_ns, yaw_rad)
         if not finder.clock.is_estimated:
             return None
-        self.offset_ns, self._supposed = offset_ns, None
+        self.offset_ns = offset_ns
+        self._supposed = None
         return finder
 
 
@@ -236,7 +253,8 @@ def camera_clock(odometry: Odometry, stamps_ns: Stamps, headings: Iterable[float
     `headings` are what `camera.turns.headings` measures between the images; their sign may be
     either, because the one that agrees better with the odometry is taken.
     """
-    finder, image_headings = CameraClockFinder(), iter(headings)
+    finder = CameraClockFinder()
+    image_headings = iter(headings)
     for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, stamps_ns):
         if kind == ODOMETRY:
             finder.add_odometry(stamp_ns, float(odometry.poses[i, 2]))

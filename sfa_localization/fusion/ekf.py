@@ -67,7 +67,8 @@ class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
         """Mean (14,), covariance (Joseph form) and squared Mahalanobis distance of the innovation,
         which stays in `y`, its covariance in `S`.
         """
-        self.x, self.P = belief.mean, belief.covariance
+        self.x = belief.mean
+        self.P = belief.covariance
         self.update(z, lambda _: jacobian, lambda x: jacobian @ x, noise, residual=_innovation)
         self.x[YAW] = wrap_angle(self.x[YAW])
         return self.x, self.P, float(self.y @ self.SI @ self.y)
@@ -90,7 +91,9 @@ class Ekf:
         rig: Rig | None = None,
         kalman: Kalman | None = None,
     ) -> None:
-        self._config, self._correlation, self._rig = config, correlation, rig or Rig()
+        self._config = config
+        self._correlation = correlation
+        self._rig = rig or Rig()
         self._noise = MotionNoise(
             config.slip_per_meter, config.yaw_per_radian, correlation.distance_m
         )
@@ -100,13 +103,16 @@ class Ekf:
         """The belief before the first message, without a pose: the prior of the robot is the rig,
         whose scale and delay are applied to all inputs.
         """
-        speed_std, rate_std, rig = self._config.speed_std, self._config.rate_std, self._rig
+        speed_std = self._config.speed_std
+        rate_std = self._config.rate_std
+        rig = self._rig
         scale_std = rig.wheel_scale.std / rig.wheel_scale.value
         of_wheels = scale_std, rig.turn_loss.std, rig.turn_factor.std, rig.speed_offset.std
         of_robot = motion.BIAS_STD, *of_wheels, rig.camera_delay.std
         covariance = np.diag(np.square([1, 1, 1, speed_std, rate_std, *of_robot, 1, 1, 1]))
         mean = np.zeros(SIZE)
-        mean[motion.LOSS], mean[motion.OFFSET] = rig.turn_loss.value, rig.speed_offset.value
+        mean[motion.LOSS] = rig.turn_loss.value
+        mean[motion.OFFSET] = rig.speed_offset.value
         mean[motion.TURN] = rig.turn_factor.value - 1.0
         twist = Twist(0.0, 0.0, speed_std**2, rate_std**2)
         nowhere = (0.0, 0.0, 0.0)
@@ -159,7 +165,8 @@ class Ekf:
         moved: the pose is predicted with the last speed, and has the uncertainty of DEGRADED until
         an image confirms it.
         """
-        belief, std_m = self.coast(belief, event.stamp_ns), self._config.degraded_std
+        belief = self.coast(belief, event.stamp_ns)
+        std_m = self._config.degraded_std
         noise = np.zeros((SIZE, SIZE))
         noise[:3, :3] = np.diag(np.square([std_m, std_m, DEGRADED_YAW_RAD]))
         odometry = received(belief, event)._replace(jump=leap)
@@ -236,7 +243,9 @@ class Ekf:
         """Accept what lies inside the gate, with less weight where it is outlying; reject what lies
         outside, or restart where the rejected images outweigh the estimate.
         """
-        kalman, memory, size = self._kalman, belief.memory, event.value.size
+        kalman = self._kalman
+        memory = belief.memory
+        size = event.value.size
         z, jacobian, white = self._linearized(belief, event)
         mean, covariance, d2 = kalman.corrected(belief, z, jacobian, white)
         inside = d2 <= GATE[size]
@@ -261,8 +270,10 @@ class Ekf:
 
         z = value - late velocity = x - DELAY velocity + sqrt(share) L ERROR + white
         """
-        size, share = event.value.size, self._correlation.share
-        moving, jacobian = motion.velocity(belief.mean)[:size], np.eye(size, SIZE)
+        size = event.value.size
+        share = self._correlation.share
+        moving = motion.velocity(belief.mean)[:size]
+        jacobian = np.eye(size, SIZE)
         jacobian[:, DELAY] = -moving
         common = math.sqrt(share) * np.linalg.cholesky(event.covariance)
         jacobian[:, ERROR : ERROR + size] = common
@@ -272,14 +283,17 @@ class Ekf:
         self, belief: Belief, event: MeasurementEvent, reason: str, place: Relocation
     ) -> Belief:
         """The belief at the place that images show."""
-        since_m, path = belief.traveled_m - place.distance_m, belief.path
+        since_m = belief.traveled_m - place.distance_m
+        path = belief.path
         path = path.placed(since_m) if reason == ELSEWHERE else path._replace(placed_m=(since_m,))
         update = Update(event.stamp_ns, True, math.nan, math.nan, reason)
         memory = Memory(support=1, accepted_ns=event.stamp_ns, update=update)
         placed = _at_pose(belief, place.pose, place.covariance, self._correlation.share)
         # Images show where the robot was a delay ago.
-        variance, by_delay = placed.covariance[DELAY, DELAY], np.zeros(SIZE)
-        by_delay[:3], by_delay[DELAY] = motion.velocity(placed.mean), 1.0
+        variance = placed.covariance[DELAY, DELAY]
+        by_delay = np.zeros(SIZE)
+        by_delay[:3] = motion.velocity(placed.mean)
+        by_delay[DELAY] = 1.0
         placed.mean[:3] += by_delay[:3] * (placed.mean[DELAY] - event.late.value)
         placed.covariance[DELAY] = placed.covariance[:, DELAY] = 0.0
         placed.covariance[:] += variance * np.outer(by_delay, by_delay)
@@ -328,7 +342,8 @@ def _at_pose(belief: Belief, pose: Array, covariance: Array, share: float) -> Be
     mean = np.array([*pose, *belief.mean[V:ERROR], 0.0, 0.0, 0.0])
     mean[YAW] = wrap_angle(mean[YAW])
     full = np.eye(SIZE)
-    full[:3, :3], full[V:ERROR, V:ERROR] = covariance, belief.covariance[V:ERROR, V:ERROR]
+    full[:3, :3] = covariance
+    full[V:ERROR, V:ERROR] = belief.covariance[V:ERROR, V:ERROR]
     full[:3, ERROR:] = -math.sqrt(share) * np.linalg.cholesky(covariance)
     full[ERROR:, :3] = full[:3, ERROR:].T
     return belief._replace(mean=mean, covariance=full, located=True)

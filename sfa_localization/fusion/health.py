@@ -33,17 +33,24 @@ from sfa_localization.fusion.relocation import AGREEING_M
 
 LIKELY = 0.9
 """Least probability of no harmful fault with which the estimate is trusted."""
-LATE_PRIOR, PRIOR = 2e-2, 5e-3
+LATE_PRIOR = 2e-2
+PRIOR = 5e-3
 """Prior probability of all delays together, and of each other fault, in any window: once in some
 hundred meters."""
-LEVER_STD_M, TURNED_STD_RAD, SCALE_STD = 1.0, 0.6, 0.5
+LEVER_STD_M = 1.0
+TURNED_STD_RAD = 0.6
+SCALE_STD = 0.5
 """Prior standard deviations: cameras move by a meter and half a right angle, wheels slip by half.
 """
-HARMLESS_M, HARMLESS_RAD = 0.4, 0.17
+HARMLESS_M = 0.4
+HARMLESS_RAD = 0.17
 """Errors of the pose below these are no fault: maps and odometry err by as much in places."""
 OUTLIERS = 0.05
 """Share of images that lie anywhere."""
-CAUTION, FLOOR_M, FLOOR_RAD, YAW_DRIFT = 4.0, 0.05, 0.02, 0.02
+CAUTION = 4.0
+FLOOR_M = 0.05
+FLOOR_RAD = 0.02
+YAW_DRIFT = 0.02
 """Factor on the variances of images and their least standard deviations, for errors that images of
 one place share; heading error of the odometry, rad per m."""
 DELAYS: Array = np.r_[-1.5:-0.2:0.3, 0.3, 0.6 : LONGEST_DELAY_S + 0.1 : 0.4]
@@ -57,7 +64,10 @@ _ANYWHERE = 1 / (100.0 * 2 * math.pi)
 """Density of poses anywhere in 100 m^2, 1/(m^2 rad)."""
 _TINY = 1e-9  # least weight of an image, so that some path fits best
 _STEPS = 2  # of reweighting, from where the fit hardly changes
-_LEVER, _TURNED, _SCALE = -3, -2, -1  # rows that have these nuisances
+# rows that have these nuisances
+_LEVER = -3
+_TURNED = -2
+_SCALE = -1
 _AHEAD_S = 0.3  # of the path: odometry may be a little behind
 
 
@@ -136,17 +146,21 @@ class _Window:
     """
 
     def __init__(self, path: DrivenPath, fixes: Sequence[PositionFix]) -> None:
-        images, newest_ns = Columns(fixes), fixes[-1].stamp_ns
+        images = Columns(fixes)
+        newest_ns = fixes[-1].stamp_ns
         self._is_recent = images.behind_m <= AGREEING_M
-        self._seconds, self._places = (images.stamps_ns - newest_ns) * 1e-9, images.place
-        self._looks, yaw_drift = np.exp(1j * images.yaw), (YAW_DRIFT * images.behind_m) ** 2
+        self._seconds = (images.stamps_ns - newest_ns) * 1e-9
+        self._places = images.place
+        self._looks = np.exp(1j * images.yaw)
+        yaw_drift = (YAW_DRIFT * images.behind_m) ** 2
         self._variance = CAUTION * images.variance + FLOOR_M**2 + images.drift
         self._yaw_variance = CAUTION * images.yaw_variance + FLOOR_RAD**2 + yaw_drift
         yaw_width = np.sqrt(2 * np.pi * np.where(images.has_yaw, self._yaw_variance, 2 * np.pi))
         self._peak = (1 - OUTLIERS) / (2 * np.pi * self._variance * yaw_width)
         stamps_ns, x, y, yaw = map(np.array, zip(*path.knots, strict=True))
         self._times = (stamps_ns - newest_ns) * 1e-9
-        self._path, self._path_yaw = x + 1j * y, np.unwrap(yaw)
+        self._path = x + 1j * y
+        self._path_yaw = np.unwrap(yaw)
         self._power = min(1.0, max(1 + images.behind_m[0], 3.0) / len(fixes))
 
     def hypotheses(self) -> list[_Hypothesis]:
@@ -158,12 +172,14 @@ class _Window:
         off = np.abs(rows[:, -1] - rows[0, -1]) > HARMLESS_M
         off |= np.abs(yaws[:, -1] - yaws[0, -1]) > HARMLESS_RAD
         logs, (lever, turned, scale) = self._fitted(rows, yaws)
-        prior, late_prior = math.log(PRIOR), math.log(LATE_PRIOR / len(DELAYS))
+        prior = math.log(PRIOR)
+        late_prior = math.log(LATE_PRIOR / len(DELAYS))
         wheels_prior = math.log(PRIOR / len(FACTORS))
         as_it_is = math.log(1 - LATE_PRIOR - 5 * PRIOR)
         unrelated = self._power * len(self._places) * math.log(_ANYWHERE)
         of_scale = abs(scale - 1) * AGREEING_M > HARMLESS_M
-        late, wheels = slice(1, len(delays)), slice(len(delays), len(rows) - 3)
+        late = slice(1, len(delays))
+        wheels = slice(len(delays), len(rows) - 3)
         of_delays = zip(logs[late] + late_prior, delays[late], off[late], strict=True)
         turned_lately = float(np.ptp(yaws[0, self._is_recent]))
         misturned = np.abs(FACTORS - 1) * turned_lately > HARMLESS_RAD
@@ -181,7 +197,8 @@ class _Window:
     def _paths(self) -> tuple[Complex, Array, Array]:
         """Places and headings (R, N) on the path by the delays (R,) for which it is long enough."""
         delays = np.append(0.0, DELAYS)
-        earliest, latest = self._seconds[0] - delays, self._seconds[-1] - delays
+        earliest = self._seconds[0] - delays
+        latest = self._seconds[-1] - delays
         covered = (earliest >= self._times[0]) & (latest <= self._times[-1] + _AHEAD_S)
         delays = delays[covered | (delays == 0.0)]
         at = self._seconds - delays[:, None]
@@ -201,19 +218,28 @@ class _Window:
         With weights w and w', centered places z and path d, and v = exp(i (yaw - h)), the error
         sum w |z - u d|^2 + w' |v - u|^2 is least for the u along sum w conj(d) z + w' v.
         """
-        arm, ones = np.exp(1j * yaws), np.ones((len(rows), 1))
-        look, weight = self._looks * np.conj(arm), np.ones(rows.shape)
-        lever, angle, factor, by_yaw = 0j * ones, 0.0 * ones, 1.0 * ones, 1.0 * ones
+        arm = np.exp(1j * yaws)
+        ones = np.ones((len(rows), 1))
+        look = self._looks * np.conj(arm)
+        weight = np.ones(rows.shape)
+        lever = 0j * ones
+        angle = 0.0 * ones
+        factor = 1.0 * ones
+        by_yaw = 1.0 * ones
         by_yaw[_TURNED] = 0.0  # before its angle is estimated
         for _ in range(_STEPS):
-            w, w_yaw = weight / self._variance, weight / self._yaw_variance
+            w = weight / self._variance
+            w_yaw = weight / self._yaw_variance
             total, of_yaw = (each.sum(1, keepdims=True) for each in (w, w_yaw))
             d, g, z = (x - (w * x).sum(1, keepdims=True) / total for x in (rows, arm, self._places))
-            looks, path = (w_yaw * look).sum(1, keepdims=True), factor * d + lever * g
+            looks = (w_yaw * look).sum(1, keepdims=True)
+            path = factor * d + lever * g
             u = (w * np.conj(path) * z).sum(1, keepdims=True)
             u = u + looks * np.exp(-1j * angle) * by_yaw
-            u, by_yaw = u / np.maximum(np.abs(u), _TINY), ones
-            arms, ways = w[_LEVER] * np.conj(g[_LEVER]), w[_SCALE] * np.conj(d[_SCALE])
+            u = u / np.maximum(np.abs(u), _TINY)
+            by_yaw = ones
+            arms = w[_LEVER] * np.conj(g[_LEVER])
+            ways = w[_SCALE] * np.conj(d[_SCALE])
             of_arm = float((arms @ g[_LEVER]).real) + LEVER_STD_M**-2
             of_path = float((ways @ d[_SCALE]).real) + SCALE_STD**-2
             of_angle = float(of_yaw[_TURNED, 0]) + TURNED_STD_RAD**-2

@@ -33,8 +33,11 @@ class History(Generic[E, B]):
         start_ns: int | None = None,
         keep: bool = False,
     ) -> None:
-        self._span_ns, self._step, self._keep = span_ns, step, keep
-        self._base, self._horizon_ns = start, start_ns
+        self._span_ns = span_ns
+        self._step = step
+        self._keep = keep
+        self._base = start
+        self._horizon_ns = start_ns
         self._keys: list[Key] = []
         self.events: list[E] = []
         self._beliefs: list[B] = []
@@ -70,7 +73,8 @@ class History(Generic[E, B]):
         belief = self._belief(at + 1)
         cut = bisect_left(self._keys, (self._keys[-1][0] - self._span_ns, 0))
         if cut and not self._keep:
-            self._base, self._horizon_ns = self._belief(cut), self._keys[cut - 1][0]
+            self._base = self._belief(cut)
+            self._horizon_ns = self._keys[cut - 1][0]
             del self._keys[:cut], self.events[:cut], self._beliefs[:cut]
         return belief
 

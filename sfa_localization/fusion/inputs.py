@@ -26,11 +26,15 @@ COMMAND_RATE_STD = 0.1
 _UNKNOWN_STDS = np.array([POSITION_STD, POSITION_STD, 0.2])  # m, m, rad
 # Least standard deviations: drivers understate what encoders resolve (m/s, rad/s), and no map from
 # images is better everywhere (m, m, rad).
-_LEAST_TWIST_STDS, _LEAST_STDS = (0.01, 0.005), np.array([0.05, 0.05, 0.02])
+_LEAST_TWIST_STDS = (0.01, 0.005)
+_LEAST_STDS = np.array([0.05, 0.05, 0.02])
 # Twists, some seconds of them, of which so many are repeated by odometry that repeats commands:
 # 0.66 to 0.82 on four small robots.
-_COMMANDS, _REPEATED = 200, 0.5
-_LARGEST_M, _LARGEST_TWIST = 1e9, 100.0  # m; m/s and rad/s: beyond, nothing is a robot's
+_COMMANDS = 200
+_REPEATED = 0.5
+# m; m/s and rad/s: beyond, nothing is a robot's
+_LARGEST_M = 1e9
+_LARGEST_TWIST = 100.0
 _SKEW = 1e-6  # of the largest entry: rounding
 
 
@@ -40,7 +44,8 @@ class OpenLoop:
     """
 
     def __init__(self) -> None:
-        self._last, self._share = (0.0, 0.0), 0.0
+        self._last = (0.0, 0.0)
+        self._share = 0.0
 
     @classmethod
     def of(cls, twists: Array) -> OpenLoop:
@@ -86,7 +91,8 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
 
     A heading too uncertain is left out. Raises DataError, with the reason, where nothing remains.
     """
-    pose, matrix = np.asarray(value, float), np.asarray(covariance, float)
+    pose = np.asarray(value, float)
+    matrix = np.asarray(covariance, float)
     if pose.shape not in ((2,), (3,)) or matrix.shape != (pose.size, pose.size):
         raise DataError('shape is not that of a position or a pose')
     if not np.all(np.abs(pose[:2]) <= _LARGEST_M):
@@ -94,7 +100,8 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
     if pose.size == 3:
         certain = 0 < matrix[2, 2] <= YAW_STD_LIMIT**2 or not matrix.any()
         if not (certain and math.isfinite(pose[2])):
-            pose, matrix = pose[:2], matrix[:2, :2]
+            pose = pose[:2]
+            matrix = matrix[:2, :2]
     if not matrix.any():
         matrix = np.diag(_UNKNOWN_STDS[: pose.size] ** 2)
     matrix = _positive(matrix)
@@ -109,7 +116,8 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
 
 def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
     """A pose (3,) and covariance (3, 3) set from outside; DataError where they cannot be one."""
-    value, matrix = np.asarray(pose, float), np.asarray(covariance, float)
+    value = np.asarray(pose, float)
+    matrix = np.asarray(covariance, float)
     if value.shape != (3,) or not np.abs(value).max() <= _LARGEST_M:
         raise DataError(f'initial pose {pose!r} is not x, y, yaw')
     if matrix.shape != (3, 3):

@@ -46,11 +46,13 @@ BIAS_WALK, SCALE_WALK, LOSS_WALK, TURN_WALK, OFFSET_WALK, DELAY_WALK = 1e-4, *[1
 """Random walks: turn-rate bias of a cheap gyroscope, rad/s per sqrt(s); wheel scale, 1/sqrt(m), a
 percent over 100 m; loss in turns, m/rad per sqrt(rad); turn factor, 1/sqrt(rad); offset of the
 speed, m/s per sqrt(s); delay of the camera, s per sqrt(s)."""
-PRIOR_CHANGE, CHANGES = 1.0, 100
+PRIOR_CHANGE = 1.0
+CHANGES = 100
 """Square of the change of speed (m/s) and turn rate (rad/s) in a second before any is observed,
 that of a hasty robot: it counts as one of the last CHANGES seconds of driving. Seven robots changed
 their turn rates by 0.02 to 0.09."""
-STANDSTILL_SPEED, STANDSTILL_RATE = 1e-3, 2e-3
+STANDSTILL_SPEED = 1e-3
+STANDSTILL_RATE = 2e-3
 """A robot slower (m/s) and turning slower (rad/s) than this stands: encoders and gyros flicker."""
 BIAS_STD = 0.01  # rad/s, of the turn-rate bias before any is learned: cheap gyroscopes
 _HELD_VARIANCE = 1e-8  # of v and omega at a standstill: keeps the covariance positive
@@ -157,7 +159,8 @@ class Pace(NamedTuple):
 
     def after(self, stamp_ns: int, twist: Twist) -> Pace:
         """After a reading at a stamp. A robot that stands on, or after a silence, shows nothing."""
-        elapsed_s, last = (stamp_ns - self.stamp_ns) * 1e-9, self.last
+        elapsed_s = (stamp_ns - self.stamp_ns) * 1e-9
+        last = self.last
         if last is not None and 0 <= elapsed_s < 1:
             return self
         anew = self._replace(stamp_ns=stamp_ns, last=twist)
@@ -185,7 +188,8 @@ def arc(yaw: float, v: float, omega: float, dt: float) -> tuple[Array, Array]:
     """
     half = omega * dt / 2
     if abs(half) < _STRAIGHT_RAD:
-        sinc, slope = 1 - half * half / 6, -half / 3
+        sinc = 1 - half * half / 6
+        slope = -half / 3
     else:
         sinc = math.sin(half) / half
         slope = (math.cos(half) - sinc) / half
@@ -229,7 +233,8 @@ def _by_errors(mean: Array, twist: Twist) -> Array:
     by_loss = offset = 0.0
     # A loss slows a robot down, but turns no motion around; what turns on the spot does not drive.
     if abs(twist.v) > max(SPOT_RADIUS_M, 2 * abs(float(mean[LOSS]))) * abs(twist.omega):
-        by_loss, offset = -math.copysign(abs(twist.omega), twist.v), 1.0
+        by_loss = -math.copysign(abs(twist.omega), twist.v)
+        offset = 1.0
     rows = [0.0, twist.v, by_loss, 0.0, offset], [-1.0, 0.0, 0.0, twist.omega, 0.0]
     return np.array(rows)
 
@@ -240,10 +245,12 @@ def coast(mean: Array, twist: Twist, dt: float, noise: MotionNoise, changes: Arr
 
     `twist` is the last reading, whose noise still counts; `changes` are those of `Pace`.
     """
-    v, omega = float(mean[V]), float(mean[OMEGA])
+    v = float(mean[V])
+    omega = float(mean[OMEGA])
     standing = v == 0.0 and omega == 0.0
     step = _stand(mean) if standing else _advance(mean, v, omega, twist, dt, noise)
-    by_twist, walk = step.jacobian[:3, V:BIAS], np.diag(changes * dt)
+    by_twist = step.jacobian[:3, V:BIAS]
+    walk = np.diag(changes * dt)
     step.noise[:3, :3] += by_twist @ walk @ by_twist.T / 3
     step.noise[:3, V:BIAS] += by_twist @ walk / 2
     step.noise[V:BIAS, :3] += walk @ by_twist.T / 2
@@ -262,7 +269,9 @@ def halt(mean: Array, twist: Twist, dt: float, noise: MotionNoise, changes: Arra
 
 def _stand(mean: Array) -> Step:
     """The wheels stand: nothing moves, and nothing becomes less certain."""
-    after, jacobian, noise = mean.copy(), np.eye(SIZE), np.zeros((SIZE, SIZE))
+    after = mean.copy()
+    jacobian = np.eye(SIZE)
+    noise = np.zeros((SIZE, SIZE))
     after[V:BIAS] = 0.0
     jacobian[V:BIAS, V:BIAS] = 0.0
     noise[V:BIAS, V:BIAS] = _HELD_VARIANCE * np.eye(2)
@@ -276,7 +285,8 @@ def _advance(
     random walks of BIAS to ERROR, and errors of readings.
     """
     moved, by_twist = arc(float(mean[YAW]), v, omega, dt)
-    meters, radians = abs(v) * dt, abs(omega) * dt
+    meters = abs(v) * dt
+    radians = abs(omega) * dt
     fade = math.exp(-(meters + TURN_RADIUS_M * radians) / noise.decorrelation_m)
     after = np.array([*(mean[:3] + moved), v, omega, *mean[BIAS:ERROR], *(fade * mean[ERROR:])])
     after[YAW] = wrap_angle(after[YAW])

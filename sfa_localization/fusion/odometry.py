@@ -16,7 +16,8 @@ from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import Belief, Jump, Odometer, OdometryEvent, Pose
 from sfa_localization.fusion.motion import Twist
 
-ODOMETRY_TIMEOUT_S, COAST_S = 0.5, 2.0
+ODOMETRY_TIMEOUT_S = 0.5
+COAST_S = 2.0
 """Odometry silent for longer is a gap: many times the period of any odometry. The last speed is
 assumed to go on for 2 s: about how long robots keep a speed."""
 _LONGEST_S = 2 * math.pi  # of a silence: at half a radian a second any heading is possible
@@ -47,10 +48,13 @@ def _moves(belief: Belief, event: OdometryEvent) -> bool:
 
 def received(belief: Belief, event: OdometryEvent) -> Odometer:
     """What is remembered of the odometry after a message that is used."""
-    last, before, after = belief.odometry, belief.odometry.pose, event.pose
+    last = belief.odometry
+    before = belief.odometry.pose
+    after = event.pose
     if before is None or after is None:
         return last._replace(stamp_ns=event.stamp_ns, pose=after, suspect=None)
-    changed, renewed_ns = before != after, last.renewed_ns
+    changed = before != after
+    renewed_ns = last.renewed_ns
     # A pose that never changed is not filled.
     if changed or (renewed_ns and not _moves(belief, event)):
         renewed_ns = event.stamp_ns
@@ -68,7 +72,8 @@ def jump(belief: Belief, event: OdometryEvent) -> Jump | None:
     """The step to a pose that no robot makes, given the speed before it and, where the message
     before was suspected of it, the speed after it: see data.odometry_steps.
     """
-    last, seconds = belief.odometry, silence_s(belief, event)
+    last = belief.odometry
+    seconds = silence_s(belief, event)
     if last.pose is None or event.pose is None or seconds > _LONGEST_S:
         return None
     beyond_m, beyond_rad = _beyond(belief, event)
@@ -80,7 +85,8 @@ def jump(belief: Belief, event: OdometryEvent) -> Jump | None:
 
 def interval(belief: Belief, event: OdometryEvent) -> tuple[Twist, Twist] | None:
     """Mean twist up to a message, and the twist from then on; None after silence without poses."""
-    seconds, reading = silence_s(belief, event), event.twist
+    seconds = silence_s(belief, event)
+    reading = event.twist
     mean = _mean_twist(belief, event, seconds)
     if belief.odometry.stamp_ns is not None and seconds > ODOMETRY_TIMEOUT_S:
         return mean and (mean, reading)
@@ -89,7 +95,8 @@ def interval(belief: Belief, event: OdometryEvent) -> tuple[Twist, Twist] | None
     if reading.v or reading.omega:
         return _remaining(belief, event, mean), reading
     # The twist is not filled. Messages stamped almost together show the way, but not the speed.
-    before, weight = belief.twist, -math.expm1(-seconds / ODOMETRY_TIMEOUT_S)
+    before = belief.twist
+    weight = -math.expm1(-seconds / ODOMETRY_TIMEOUT_S)
     v = before.v + weight * (mean.v - before.v)
     omega = before.omega + weight * (mean.omega - before.omega)
     return _remaining(belief, event, mean), mean._replace(v=v, omega=omega)
@@ -97,7 +104,8 @@ def interval(belief: Belief, event: OdometryEvent) -> tuple[Twist, Twist] | None
 
 def _mean_twist(belief: Belief, event: OdometryEvent, seconds: float) -> Twist | None:
     """The mean twist since the last message by the poses; None where they do not show it."""
-    before, after = belief.odometry.pose, event.pose
+    before = belief.odometry.pose
+    after = event.pose
     if before is None or after is None or before == after or not 0 < seconds <= _LONGEST_S:
         return None
     if _is_sideways_or_first(belief, event):
@@ -120,11 +128,13 @@ def _is_sideways_or_first(belief: Belief, event: OdometryEvent) -> bool:
 
 def _beyond(belief: Belief, event: OdometryEvent) -> tuple[float, float]:
     """How far, m and rad, the step to a message's pose lies beyond the speeds around it."""
-    last, after = belief.odometry, event.pose
+    last = belief.odometry
+    after = event.pose
     assert last.pose is not None and after is not None
     seconds = max(silence_s(belief, event), 0.0)
     turn, *way = _moved(last.pose, after)
-    speeds, rates = [(belief.twist.v, 0.0)], [(belief.twist.omega,)]
+    speeds = [(belief.twist.v, 0.0)]
+    rates = [(belief.twist.omega,)]
     if last.suspect and last.suspect.pose and event.stamp_ns > last.suspect.stamp_ns:
         step_s = (event.stamp_ns - last.suspect.stamp_ns) * 1e-9
         turn_after, ahead, aside = _moved(last.suspect.pose, after)
@@ -150,8 +160,10 @@ def _remaining(belief: Belief, event: OdometryEvent, mean: Twist) -> Twist:
 def _moved(before: Pose, after: Pose) -> tuple[float, float, float]:
     """Turn and displacement (ahead, left) of a pose, in the frame of the mean of both headings."""
     turn = float(wrap_angle(after[2] - before[2]))
-    c, s = math.cos(before[2] + turn / 2), math.sin(before[2] + turn / 2)
-    dx, dy = after[0] - before[0], after[1] - before[1]
+    c = math.cos(before[2] + turn / 2)
+    s = math.sin(before[2] + turn / 2)
+    dx = after[0] - before[0]
+    dy = after[1] - before[1]
     return turn, dx * c + dy * s, dy * c - dx * s
 
 
@@ -169,7 +181,8 @@ def stalled(before: Belief, after: Belief, taken_ns: int, stamp_ns: int) -> bool
     """
     if after.odometry.stamp_ns is None or after.odometry.stamp_ns <= taken_ns:
         return False
-    seconds, silent_s = (stamp_ns - taken_ns) * 1e-9, (taken_ns - before.stamp_ns) * 1e-9
+    seconds = (stamp_ns - taken_ns) * 1e-9
+    silent_s = (taken_ns - before.stamp_ns) * 1e-9
     turn, *way = _moved(before.dead_reckoned, after.dead_reckoned)
     driven = (math.hypot(*way), before.twist.v, after.twist.v)
     turned = (abs(turn), before.twist.omega, after.twist.omega)

@@ -74,7 +74,8 @@ class PoseFilter:
         self.counts: Counter[str] = Counter()
         self.scale = self.config.odometry_scale
         self._nis = 0.0, 0
-        self._camera, self._expected_s = CameraClockFinder(_CLOCK_MEMORY), 0.0
+        self._camera = CameraClockFinder(_CLOCK_MEMORY)
+        self._expected_s = 0.0
         self._images = ImageClock(_CLOCK_MEMORY)
         self._rig = Rig()
         self._ekf = Ekf(self.config, self.correlation, self._rig)
@@ -91,7 +92,8 @@ class PoseFilter:
     ) -> None:
         """Go on with other parameters, or another model's errors, from what is believed now."""
         before = self.config, self.correlation
-        self.config, self.correlation = config or self.config, correlation or self.correlation
+        self.config = config or self.config
+        self.correlation = correlation or self.correlation
         if (self.config, self.correlation) != before:
             self._ekf = Ekf(self.config, self.correlation, self._rig)
             self._go_on(self._history.newest)
@@ -103,8 +105,11 @@ class PoseFilter:
         # Stamps may start anew; the camera's delay stays what it was.
         self._camera = CameraClockFinder(_CLOCK_MEMORY, self._camera.clock)
         self._history = self._fresh(self._ekf.blank(0))
-        self._timeline, self._open_loop = Timeline(), OpenLoop()
-        self._paths, self._orientation, self._was_empty = Paths(), Orientation(), False
+        self._timeline = Timeline()
+        self._open_loop = OpenLoop()
+        self._paths = Paths()
+        self._orientation = Orientation()
+        self._was_empty = False
         self._judged: tuple[object, Health] | None = None
         self._waiting: tuple[Array, Array] | None = None
         if self.config.initial_pose:
@@ -114,7 +119,8 @@ class PoseFilter:
         return History(HISTORY_NS, start, self._ekf.step, start_ns)
 
     def _initial_covariance(self) -> Array:
-        position, yaw = self.config.initial_position_std, self.config.initial_yaw_std
+        position = self.config.initial_position_std
+        yaw = self.config.initial_yaw_std
         return np.diag(np.square([position, position, yaw]))
 
     # Inputs.
@@ -140,7 +146,8 @@ class PoseFilter:
     def forget_pose(self) -> None:
         """The robot may be anywhere; what is estimated of its camera and odometry stays."""
         self.counts['pose forgotten'] += 1
-        self._waiting, belief = None, self._history.newest
+        self._waiting = None
+        belief = self._history.newest
         path = belief.path._replace(placed_m=DrivenPath().placed_m)
         self._go_on(belief._replace(located=False, memory=Memory(), path=path))
 
@@ -186,7 +193,8 @@ class PoseFilter:
         """
         posed = pose is not None and all(map(math.isfinite, pose))
         empty = not (posed or v or omega) and self._history.newest.odometry.pose is not None
-        was_empty, self._was_empty = self._was_empty, empty
+        was_empty = self._was_empty
+        self._was_empty = empty
         if empty and not was_empty:
             raise DataError('neither pose nor twist')
         if pose is None or not posed:
@@ -243,7 +251,8 @@ class PoseFilter:
         if odometry_ns is not None:
             finder = self._images.add_heading(int(stamp_ns), yaw_rad, odometry_ns)
             if finder is not None:
-                self._camera, self._expected_s = finder, 0.0
+                self._camera = finder
+                self._expected_s = 0.0
                 text = clock_difference(self._images.offset_ns)
                 self.counts[f'images: {text}; taken into account'] += 1
         self._camera.add_heading(int(stamp_ns) - self._images.offset_ns, yaw_rad)
@@ -256,7 +265,8 @@ class PoseFilter:
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.is_estimated:
             self._expected_s = delay_s
             self._camera = CameraClockFinder(_CLOCK_MEMORY, CameraClock(delay_s, assumed=True))
-        belief, prior = self._history.newest, self._ekf.blank(0)
+        belief = self._history.newest
+        prior = self._ekf.blank(0)
         # The pose of odometry jumps to the new scale: forget the one before.
         belief = belief._replace(odometry=belief.odometry._replace(pose=None))
         if not belief.located:
@@ -319,7 +329,8 @@ class PoseFilter:
 
     def _at(self, stamp_ns: int) -> State | None:
         """If odometry repeats commands, the robot is where it was one delay ago."""
-        robot_ns, delay_ns = stamp_ns, self._camera.clock.delay_ns if self._open_loop.repeats else 0
+        robot_ns = stamp_ns
+        delay_ns = self._camera.clock.delay_ns if self._open_loop.repeats else 0
         if 0 < abs(delay_ns) <= DELAY_LIMIT_NS and self._history.reaches(stamp_ns - delay_ns):
             robot_ns -= delay_ns
         state = self._ekf.coast(self._history.before(robot_ns), robot_ns).state
@@ -328,7 +339,8 @@ class PoseFilter:
     @property
     def _newest(self) -> Belief:
         """The belief at the stamp of the newest message."""
-        newest, newest_ns = self._history.newest, self._history.newest_ns
+        newest = self._history.newest
+        newest_ns = self._history.newest_ns
         return self._ekf.coast(newest, newest_ns) if newest_ns else newest
 
     @property
@@ -343,7 +355,8 @@ class PoseFilter:
     @property
     def status(self) -> Status:
         """How far the estimate at the newest message can be trusted, and why not further."""
-        newest, clock = self._newest, self._camera.clock
+        newest = self._newest
+        clock = self._camera.clock
         status = status_of(newest, newest.state, self.health, self.config)
         doubts = self._timeline.problems
         if self.odometry_in_turn:

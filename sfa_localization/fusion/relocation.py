@@ -22,7 +22,8 @@ from sfa_localization.fusion.motion import YAW
 
 FEW_IMAGES = 3
 """Fewest agreeing images: two always agree on some motion; the third is the test."""
-AGREEING_M, AGREEING_STDS = 2.0, 3.0
+AGREEING_M = 2.0
+AGREEING_STDS = 3.0
 """Distance over which images must agree, because nearer ones share their errors, and standard
 deviations within which two of them do."""
 START_YAW_STD = 0.3
@@ -55,7 +56,8 @@ class Relocation(NamedTuple):
 
     def outweighs(self, belief: Belief) -> bool:
         """Whether agreeing images outweigh the estimate that they contradict."""
-        images, support = self.images, belief.memory.support
+        images = self.images
+        support = belief.memory.support
         if images < AGREEING_PER_OTHER * self.contradicting or images <= self.dissenting:
             return False
         # A new estimate is overruled by one image more than support it.
@@ -92,7 +94,8 @@ def _turns(fixes: Columns) -> list[tuple[float, float]]:
     if fixes.has_yaw[-1]:
         turn = float(wrap_angle(fixes.yaw[-1] - fixes.path_yaw[-1]))
         turns.append((turn, float(fixes.yaw_variance[-1])))
-    both, reach = fixes.variance + fixes.variance[-1], np.abs(fixes.path)
+    both = fixes.variance + fixes.variance[-1]
+    reach = np.abs(fixes.path)
     for i in np.flatnonzero(reach > AGREEING_STDS * np.sqrt(both)):
         turn = float(np.angle((fixes.place[i] - fixes.place[-1]) * np.conj(fixes.path[i])))
         turns.append((turn, float(both[i] / reach[i] ** 2)))
@@ -123,14 +126,16 @@ def _fitted(
     yaw_weight = has_yaw / (fixes.yaw_variance + fixes.drift)
     total = weight.sum()
     middle = (weight @ fixes.place) / total
-    path, place = fixes.path - (weight @ fixes.path) / total, fixes.place - middle
+    path = fixes.path - (weight @ fixes.path) / total
+    place = fixes.place - middle
     image_turns = np.exp(1j * (turn + _yaw_residual(fixes, turn)))
     turn = float(np.angle(weight @ (np.conj(path) * place) + yaw_weight @ image_turns))
     reach = np.exp(1j * turn) * path[-1]
     turn_variance = 1 / (weight @ np.abs(path) ** 2 + yaw_weight.sum() + _TINY)
     by_turn = np.array([-reach.imag, reach.real, 1.0])
     covariance = np.diag([1 / total, 1 / total, 0.0]) + turn_variance * np.outer(by_turn, by_turn)
-    count, distance_m = int(agree.sum()), float(fixes.behind_m[agree].max())
+    count = int(agree.sum())
+    distance_m = float(fixes.behind_m[agree].max())
     # Neighboring images err alike and count as fewer.
     dependence = max(1.0, count / (1 + distance_m / decorrelation_m))
     newest = middle + reach

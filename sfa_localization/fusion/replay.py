@@ -60,7 +60,8 @@ def replay(
     for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, stamps_ns):
         if kind == ODOMETRY:
             v, omega = odometry.twists[i].tolist()
-            noise, pose = odometry.variances[i].tolist(), odometry.poses[i].tolist()
+            noise = odometry.variances[i].tolist()
+            pose = odometry.poses[i].tolist()
             if not fused.add_odometry(stamp_ns, v, omega, noise, pose):
                 yield stamp_ns, None, None
             continue

@@ -94,7 +94,8 @@ class Smoother(PoseFilter):
 
     def smoothed(self) -> list[State]:
         """The smoothed estimates at the stamps of odometry, from the first start on."""
-        states, kalman = list[State](), _Recording()
+        states = list[State]()
+        kalman = _Recording()
         ekf = Ekf(self.config, self.correlation, self._rig, kalman)
         for belief, history in self._pieces:
             stages = list[_Stage]()
@@ -109,14 +110,16 @@ class Smoother(PoseFilter):
 def _smoothed(stages: list[_Stage]) -> list[State]:
     """Backward through the stages of one drive."""
     states: list[State] = []
-    mean, covariance = np.zeros(0), np.zeros((0, 0))
+    mean = np.zeros(0)
+    covariance = np.zeros((0, 0))
     following = False
     for stage in reversed(stages):
         belief = stage.belief
         if not belief.located:
             break
         if not following:
-            mean, covariance = belief.mean, belief.covariance
+            mean = belief.mean
+            covariance = belief.covariance
         if isinstance(stage.event, OdometryEvent):
             states.append(State(stage.event.stamp_ns, mean, symmetric(covariance)))
         following = stage.follows
@@ -127,7 +130,8 @@ def _smoothed(stages: list[_Stage]) -> list[State]:
 
 def _back(prediction: _Prediction, mean: Array, covariance: Array) -> tuple[Array, Array]:
     """The smoothed estimate before a prediction, from that after it."""
-    before, predicted = prediction.before, prediction.covariance
+    before = prediction.before
+    predicted = prediction.covariance
     std = np.sqrt(np.maximum(np.diag(predicted), _RIDGE))
     correlation = predicted / np.outer(std, std) + _RIDGE * np.eye(len(std))
     forward = prediction.jacobian @ before.covariance

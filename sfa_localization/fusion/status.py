@@ -19,7 +19,9 @@ from sfa_localization.fusion.odometry import ODOMETRY_TIMEOUT_S
 from sfa_localization.fusion.relocation import FEW_IMAGES
 from sfa_localization.fusion.settings import FilterConfig
 
-LEAST_SILENCE_S, MOST_SILENCE_S, PERIODS = 1.4, 3.0, 1.25
+LEAST_SILENCE_S = 1.4
+MOST_SILENCE_S = 3.0
+PERIODS = 1.25
 """Images are reported missing after 1.25 usual periods, within these limits: without images nothing
 shows that the robot is carried away."""
 DEGRADED_YAW_RAD = 0.2
@@ -86,7 +88,9 @@ def _larger_stds(state: State, std_m: float, std_rad: float) -> list[str]:
 
 
 def _silences(belief: Belief) -> list[str]:
-    reasons, memory, odometry = [], belief.memory, belief.odometry
+    reasons = []
+    memory = belief.memory
+    odometry = belief.odometry
     jump = odometry.jump
     if jump and jump.stamp_ns > (memory.accepted_ns or 0):
         size = f'{jump.way_m:.1f} m and {math.degrees(jump.turn_rad):.0f} deg'

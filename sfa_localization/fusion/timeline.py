@@ -16,10 +16,12 @@ ODOMETRY, POSE, MEASUREMENT = range(3)
 """Kinds of events, in the order in which those of one stamp follow each other."""
 HISTORY_NS = 5_000_000_000
 """How late a measurement may come: many times what any camera, network and model take."""
-LEAP_NS, PERIODS = 500_000_000, 2.5
+LEAP_NS = 500_000_000
+PERIODS = 2.5
 """A stamp leaps ahead where it lies farther than this, and than so many periods of the odometry,
 after all before it: its clock is wrong, or there was a pause."""
-FEW_AHEAD, FEW_BEHIND = 3, 5
+FEW_AHEAD = 3
+FEW_BEHIND = 5
 """So many messages in a row that leap ahead, or are too late, are no accident: there was a pause,
 or the clock has gone back."""
 AHEAD = 'stamp ahead of those before'
@@ -39,7 +41,8 @@ class Timeline:
         # Messages in a row that leap ahead: kind, stamp, and what takes each once more.
         self._leaps: list[tuple[int, int, Callable[[], object]]] = []
         self._retaking = False
-        self._other_clock, self._period_ns = (0, 0), 0
+        self._other_clock = (0, 0)
+        self._period_ns = 0
         # Consecutive odometry with old stamps: how many messages lie among earlier ones, and the
         # first and last stamp.
         self._again = 0, 0, 0
@@ -69,16 +72,20 @@ class Timeline:
         if len(self._leaps) + 1 < FEW_AHEAD:
             self._leaps.append((kind, stamp_ns, again))
             raise DataError(AHEAD)
-        waiting, self._leaps, self._retaking = self._leaps, [], True
+        waiting = self._leaps
+        self._leaps = []
+        self._retaking = True
         for *_, take in waiting:
             take()
-        self._retaking, self._period_ns = False, stamp_ns - (history.newest_ns or stamp_ns)
+        self._retaking = False
+        self._period_ns = stamp_ns - (history.newest_ns or stamp_ns)
 
     def require_place(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
         """Raises DataError for a stamp that cannot be used, and ClockWentBack."""
         if stamp_ns <= 0:
             raise DataError('zero or negative stamp')
-        newest_ns, odometry_ns = history.newest_ns, history.newest.odometry.stamp_ns
+        newest_ns = history.newest_ns
+        odometry_ns = history.newest.odometry.stamp_ns
         if newest_ns is None:
             return
         reason = ''

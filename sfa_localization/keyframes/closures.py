@@ -97,7 +97,8 @@ def views_of(
     counts = [len(run.panoramas) for run in runs]
     chosen = np.arange(sum(counts)) if chosen is None else chosen
     run = np.repeat(np.arange(len(runs)), counts)[chosen]
-    starts, textures = np.cumsum([0, *counts]), []
+    starts = np.cumsum([0, *counts])
+    textures = []
     for image, number in zip(chosen.tolist(), run.tolist(), strict=True):
         at = image - int(starts[number])
         textures.append(texture(runs[number].panoramas.read(at, at + 1)[0]))
@@ -121,7 +122,8 @@ class ImageSearch:
     """Finds the images that are alike among those of `views`, by their `spectra` (S, rows, F)."""
 
     def __init__(self, views: Textures) -> None:
-        self.views, self.spectra = views, spectra_of(views.textures)
+        self.views = views
+        self.spectra = spectra_of(views.textures)
         self._coarse = coarse(self.spectra)
 
     def candidates(self, row: int, rows: Indices) -> Indices:
@@ -143,7 +145,8 @@ def find_closures(views: Textures, clockwise: bool) -> Closures:
     compared. `clockwise`: whether columns grow clockwise seen from above.
     """
     views = views.take(evenly(len(views.images), SAMPLES))
-    search, rows = ImageSearch(views), np.arange(len(views.images))
+    search = ImageSearch(views)
+    rows = np.arange(len(views.images))
     numbers, drive = np.unique(views.run, return_inverse=True)
     likest, shifts = np.zeros((2, len(numbers), len(rows)))
     likest = likest.astype(np.int64)
@@ -154,7 +157,8 @@ def find_closures(views: Textures, clockwise: bool) -> Closures:
             if len(others):
                 score, shift = search.correlate(row, others)
                 top = score.argmax()
-                likest[number, row], scores[number, row] = others[top], score[top]
+                likest[number, row] = others[top]
+                scores[number, row] = score[top]
                 shifts[number, row] = shift[top]
     back = likest[drive, likest]
     kept = (scores >= LIKE) & (np.abs(back - rows) <= 1) & (rows < likest)

@@ -27,7 +27,8 @@ from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.statistics import MEDIAN_TO_STD, surprise
 from sfa_localization.keyframes.regression import Fit
 
-LEAST_STD, LEAST_M = 1e-3, 0.01
+LEAST_STD = 1e-3
+LEAST_M = 0.01
 """rad, m: least standard deviations of a pose. (With 1 mm, ellipses contained 69 % of the errors in
 another light.)"""
 

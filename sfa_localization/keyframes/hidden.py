@@ -21,7 +21,8 @@ from sfa_localization.keyframes.texture import Spectra, Texture, channels, colum
 _RIDGE = 0.1
 # A plane is fitted to the nearest that saw the missing part, of many: on a dense drive most face
 # the same way. With 20 or 32 of them images err alike, with 64 by a twentieth more.
-_NEIGHBORS, _CANDIDATES = 32, 512
+_NEIGHBORS = 32
+_CANDIDATES = 512
 _TINY = 1e-6
 
 
@@ -58,7 +59,8 @@ def completed(spectra: Spectra, seen: Mask, places: Array) -> Spectra:
     (K, rows, columns) and places (K, 2) m. What no neighbor saw is 0.
     """
     textures = columns_of(spectra, seen.shape[2]) * seen
-    whole, tree = textures.copy(), cKDTree(places)
+    whole = textures.copy()
+    tree = cKDTree(places)
     for row in np.flatnonzero(~seen.all(axis=(1, 2))).tolist():
         missing = ~seen[row]
         _, near = tree.query(places[row], min(_CANDIDATES, len(places)))

@@ -80,7 +80,8 @@ class Keyframes:
         if len(poses) < FEWEST:
             raise DataError(f'{len(poses)} images are too few for keyframes')
         values, step = encoded(textures, poses, sphere, seen)
-        columns, trained = textures.shape[2], int(drives.max()) + 1
+        columns = textures.shape[2]
+        trained = int(drives.max()) + 1
         return cls(values, step, columns, poses, ErrorModel(), sphere, drives, trained, seen)
 
     def take(self, rows: NDArray[Any]) -> Keyframes:
@@ -161,14 +162,18 @@ class Keyframes:
         slopes = spectrum(derivatives(columns_of(image, self.columns), self.channels, self.sphere))
         by_turn = image * (1j * np.arange(image.shape[1])).astype(np.complex64)
         changes = turned(np.concatenate([image[None], slopes, by_turn[None]]), self.sign * yaw)
-        places, drives = self.poses[rows, :2], self.drives[rows]
+        places = self.poses[rows, :2]
+        drives = self.drives[rows]
         keyframes = self.aligned(rows)
         if self.seen is not None:
             seen = turned_mask(self.seen, self.sign * yaw)
-            changes, keyframes = masked(changes, seen), masked(keyframes, seen)
+            changes = masked(changes, seen)
+            keyframes = masked(keyframes, seen)
         fit = regress(changes, keyframes, places, drives, self.channels, self.columns)
-        facing, turn = complex(fit.shares @ np.exp(1j * self.poses[rows, 2])), float(fit.changes[2])
-        yaw, residual = yaw - self.sign * turn, turned(fit.residual, -turn)
+        facing = complex(fit.shares @ np.exp(1j * self.poses[rows, 2]))
+        turn = float(fit.changes[2])
+        yaw = yaw - self.sign * turn
+        residual = turned(fit.residual, -turn)
         return dataclasses.replace(fit, yaw=yaw, facing=facing, residual=residual)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
@@ -181,10 +186,13 @@ class Keyframes:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]], sphere: Sphere) -> Keyframes:
         """Read the arrays of `to_arrays`, of panoramas that show so much of the `sphere`."""
-        values, step = np.asarray(arrays['values'], np.int8), float(arrays['step'])
-        poses, drives = arrays['poses'].astype(float), arrays['drives'].astype(np.int32)
+        values = np.asarray(arrays['values'], np.int8)
+        step = float(arrays['step'])
+        poses = arrays['poses'].astype(float)
+        drives = arrays['drives'].astype(np.int32)
         errors = ErrorModel(*arrays['errors'].astype(float).tolist())
-        columns, trained = int(arrays['columns']), int(arrays['trained'])
+        columns = int(arrays['columns'])
+        trained = int(arrays['trained'])
         seen = np.asarray(arrays['seen'], bool) if 'seen' in arrays else None
         return cls(values, step, columns, poses, errors, sphere, drives, trained, seen)
 
@@ -203,7 +211,8 @@ def encoded(
     sign = 1 if sphere.clockwise else -1
     spectra = turned(spectra_of(textures), sign * poses[:, 2])
     if seen is not None:
-        known, at = spectra, poses
+        known = spectra
+        at = poses
         if others is not None:
             known = np.concatenate([spectra, others.aligned(slice(None))])
             at = np.concatenate([poses, others.poses])

@@ -41,7 +41,8 @@ level cameras seemed to lean by up to 4.4 of them; one that leaned by 8 degrees 
 
 def camera_lean(runs: Sequence[Run], sphere: Sphere) -> Array:
     """Roll and pitch (2,) rad of the camera on the robot; 0 where it does not lean for certain."""
-    chosen, lean = evenly(sum(len(run.panoramas) for run in runs), SAMPLES), np.zeros(2)
+    chosen = evenly(sum(len(run.panoramas) for run in runs), SAMPLES)
+    lean = np.zeros(2)
     for _ in range(_PASSES):
         level = [upright_run(run, lean, sphere) for run in runs]
         pairs = tilt_pairs(views_of(level, chosen=chosen), sphere)
@@ -55,7 +56,8 @@ def upright_run(run: Run, lean: Array, sphere: Sphere) -> Run:
     """A run as by an upright camera, from one that leans by roll and pitch (2,) rad."""
     if not lean.any():
         return run
-    size, tilts = run.panoramas.shape[:2], np.tile(lean, (len(run.panoramas), 1))
+    size = run.panoramas.shape[:2]
+    tilts = np.tile(lean, (len(run.panoramas), 1))
     seen = visible(lean, *size, sphere)
     if run.seen is not None:
         seen &= leveled(run.seen.astype(np.uint8) * 255, lean, sphere) == 255
@@ -72,7 +74,8 @@ def leveled_runs(
     """
     counts = [len(run.panoramas) for run in runs]
     sets = -(-sum(counts) // SAMPLES)
-    tilts, level = np.zeros(sum(counts), complex), tuple(runs)
+    tilts = np.zeros(sum(counts), complex)
+    level = tuple(runs)
     for start in range(sets):
         rows = np.arange(start, len(tilts), sets)
         for _ in range(_PASSES):
@@ -109,7 +112,8 @@ class TiltPairs:
     @property
     def leans(self) -> bool:
         """Whether the camera leans for certain, and by enough to matter."""
-        images, rest = max(len(np.unique(self.first)), 1), self.upright().tilt
+        images = max(len(np.unique(self.first)), 1)
+        rest = self.upright().tilt
         squares = np.sum(np.abs(rest) ** 2) / (np.sum(np.abs(1 - self.turn) ** 2) + 1) / images
         return abs(self.lean) > max(float(TILTED_RAD), _CERTAIN * float(np.sqrt(squares)))
 
@@ -124,7 +128,8 @@ class TiltPairs:
 
     def tilts(self, removed: Complex) -> Complex:
         """The tilts (S,) of images from which tilts (S,) were `removed` already."""
-        count, rows = len(removed), np.arange(len(self.tilt))
+        count = len(removed)
+        rows = np.arange(len(self.tilt))
         shape = len(rows), count
         difference = sparse.csr_matrix((np.ones(len(rows)), (rows, self.first)), shape)
         difference = difference - sparse.csr_matrix((self.turn, (rows, self.second)), shape)
@@ -135,7 +140,8 @@ class TiltPairs:
 
 def tilt_pairs(views: Textures, sphere: Sphere) -> TiltPairs:
     """Pairs of each image and those that it is likest, along other stretches of driving."""
-    search, rows = ImageSearch(views), np.arange(len(views.images))
+    search = ImageSearch(views)
+    rows = np.arange(len(views.images))
     _, height, columns = views.textures.shape
     pairs = [np.zeros((0, 5))]
     for row in rows.tolist():

@@ -18,7 +18,9 @@ from sfa_localization.keyframes.texture import Spectra
 
 # Places over which the pattern is averaged, about ten meters of driving; the weight of the initial
 # zero pattern, in places; and the spacing of places, m: a standing robot adds none.
-_AVERAGED, _BEFORE, _SPACING_M = 40, 10, 0.25
+_AVERAGED = 40
+_BEFORE = 10
+_SPACING_M = 0.25
 # Share of the newest image in the probabilities of scales: they follow about ten images.
 _NEWEST = 0.1
 
@@ -31,7 +33,8 @@ class Conditions:
     def __init__(self) -> None:
         self.pattern: Spectra | None = None
         self.scales = np.full(len(SCALES), 1 / len(SCALES))
-        self._places, self._last = 0, np.full(2, np.inf)
+        self._places = 0
+        self._last = np.full(2, np.inf)
 
     @property
     def slow_error_factor(self) -> float:
@@ -41,11 +44,13 @@ class Conditions:
     def add(self, location: Location) -> None:
         """Learn from an image that was located with these conditions."""
         self.scales = self.scales + _NEWEST * (location.scales - self.scales)
-        place, fit = location.pose[:2], location.fit
+        place = location.pose[:2]
+        fit = location.fit
         # At the border of the keyframes the residual is also due to the place.
         if fit.outward > BORDER or np.hypot(*(place - self._last)) < _SPACING_M:
             return
-        self._places, self._last = self._places + 1, place
+        self._places = self._places + 1
+        self._last = place
         share = np.float32(1 / min(self._places + _BEFORE, _AVERAGED))
         before = np.zeros_like(fit.residual) if self.pattern is None else self.pattern
         # The pattern so far was subtracted from the image before the fit.

@@ -35,7 +35,9 @@ from sfa_localization.keyframes.regression import Fit
 from sfa_localization.keyframes.texture import Spectra, columns_of, turned
 from sfa_localization.keyframes.upright import UprightImage, without
 
-STARTS, SPACING_M, SPACING_RAD = 3, 1.0, 0.5
+STARTS = 3
+SPACING_M = 1.0
+SPACING_RAD = 0.5
 """Most starts, and their least distance in position or heading: one regression resolves nearer
 places."""
 LESS_LIKE = 0.1
@@ -95,7 +97,8 @@ def located(
     by_keyframes = errors.variance(by_residual, outward, unlike)[:, None]
     by_slow = errors.slow_variance(slow[1], unlike)[:, None]
     total = by_keyframes + by_slow * SCALES
-    gain, difference = by_keyframes / total, slow[0] - places
+    gain = by_keyframes / total
+    difference = slow[0] - places
     joint = evidence[:, None] + np.log(scales) - np.log(total)
     joint -= (difference**2).sum(1)[:, None] / (2 * total)
     weight = np.exp(joint - joint.max())
@@ -104,21 +107,25 @@ def located(
     by_fit = weight.sum(axis=1)
     here = starts == np.bincount(starts.astype(int), by_fit).argmax()
     near = np.where(here[:, None], weight, 0.0) / by_fit[here].sum()
-    place, of_fit = np.tensordot(near, means, 2), near.sum(axis=1)
+    place = np.tensordot(near, means, 2)
+    of_fit = near.sum(axis=1)
     yaw = float(np.angle(of_fit @ np.exp(1j * yaws)))
     # The covariance of position and heading omits the other hypotheses.
-    covariance, offset = np.zeros((3, 3)), means - place
+    covariance = np.zeros((3, 3))
+    offset = means - place
     covariance[:2, :2] = np.einsum('hs,hsi,hsj->ij', weight, offset, offset)
     covariance[:2, :2] += float((weight * by_keyframes * (1 - gain)).sum()) * np.eye(2)
     covariance[2, 2] = by_fit @ (wrap_angle(yaws - yaw) ** 2 + errors.yaw_variance(unlike))
-    fit, pose = fits[int(of_fit.argmax())], np.array([*place, wrap_angle(yaw)])
+    fit = fits[int(of_fit.argmax())]
+    pose = np.array([*place, wrap_angle(yaw)])
     facing = complex(of_fit @ np.array([f.facing for f in fits]))
     return Location(pose, covariance, fit, facing, weight.sum(axis=0), tilt)
 
 
 def _from_starts(keyframes: Keyframes, image: UprightImage, pattern: Spectra | None) -> list[Fit]:
     """Hypotheses of an image in each light of the training from each start."""
-    likely, lights = list[Fit](), keyframes.likeliest_lights(image.scores)
+    likely = list[Fit]()
+    lights = keyframes.likeliest_lights(image.scores)
     for start, (x, y, yaw) in enumerate(_starts(keyframes, image)):
         spectrum = image.spectrum
         if pattern is not None:
@@ -146,7 +153,8 @@ def _headings(keyframes: Keyframes, image: UprightImage, row: int) -> list[float
     """The heading rad with the highest correlation with a keyframe, and a second one with nearly
     the same: in a corridor, turned by 180 degrees.
     """
-    first, columns = float(image.yaws[row]), keyframes.columns
+    first = float(image.yaws[row])
+    columns = keyframes.columns
     product = (keyframes.aligned([row])[0] * image.visible.conj()).sum(axis=0)
     curve = 2 * columns_of(product, 2 * columns)
     yaws = -keyframes.sign * np.pi / columns * np.arange(len(curve))

@@ -21,7 +21,8 @@ from sfa_localization.keyframes.keyframes import FEWEST, NEIGHBORS, Keyframes
 
 # Spacing of the views that are located, along a drive or in a turn, which shows where the camera
 # sits: the errors of nearer ones are alike.
-_SPACING_M, _SPACING_RAD = 0.5, 0.5
+_SPACING_M = 0.5
+_SPACING_RAD = 0.5
 # An image whose unexplained part exceeds this was taken at another place, or outside of the others.
 _UNLIKE = 0.5
 
@@ -54,7 +55,8 @@ class Offsets:
 def find_offsets(views: Textures, poses: Array, sphere: Sphere) -> Offsets:
     """Offsets of views by their rough poses (S, 3) in any frame; NaN for views without one."""
     placed = np.flatnonzero(np.isfinite(poses).all(axis=1))
-    views, poses = views.take(placed), poses[placed]
+    views = views.take(placed)
+    poses = poses[placed]
     if len(poses) < FEWEST:
         return Offsets.none()
     drives = views.run.astype(np.int32)
@@ -70,7 +72,8 @@ def find_offsets(views: Textures, poses: Array, sphere: Sphere) -> Offsets:
         if fit.unlike < _UNLIKE:
             shares, turn = np.zeros((2, NEIGHBORS))
             others = np.full(NEIGHBORS, near[0])
-            others[: len(near)], shares[: len(near)] = near, fit.shares
+            others[: len(near)] = near
+            shares[: len(near)] = fit.shares
             turn[: len(near)] = fit.yaw - poses[near, 2]
             offsets.append((row, others, shares, turn, fit.unlike))
     if not offsets:

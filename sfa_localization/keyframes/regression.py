@@ -93,7 +93,8 @@ def regress(
     pitch and a turn, at the heading of the keyframes. Textures have so many `columns`, and their
     `channels` are rows; keyframes of different `drives` (N,) may differ by their light.
     """
-    count, heights = len(keyframes), [part.stop - part.start for part in channels]
+    count = len(keyframes)
+    heights = [part.stop - part.start for part in channels]
     spectra = np.concatenate([keyframes, image])
     weighted = spectra * _root_weights(spectra.shape[2], columns)
     parts = (weighted[:, part].reshape(len(spectra), -1).view(np.float32) for part in channels)
@@ -171,7 +172,8 @@ def _regression(products: Array, basis: _Basis) -> tuple[Array, Array, Array, fl
     count = len(basis.mean)
     # Project out drive mean, likeness, tilt and heading; `gram` is that of the residuals.
     nuisance = np.eye(len(products))[count:]
-    nuisance[0, :count], nuisance[0, count] = basis.mean, 0.0
+    nuisance[0, :count] = basis.mean
+    nuisance[0, count] = 0.0
     within = nuisance @ products @ nuisance.T
     square = max(float(within[0, 0]), 1e-12)
     within[np.diag_indices(len(within))] += 1e-9 * within.diagonal() + 1e-12
@@ -191,7 +193,8 @@ def _regression(products: Array, basis: _Basis) -> tuple[Array, Array, Array, fl
     kept = max(float(nuisance[0] @ products[:, count]) / square, 0.0)
     unexplained = max(float(combine[0] @ products @ combine[0]) / square, 0.0)
     unlike = (unexplained + _TINY) / (kept**2 + _TINY**2)
-    shares, changes = basis.mean - solution[0] @ basis.centered, -combine[0, count + 1 :]
+    shares = basis.mean - solution[0] @ basis.centered
+    changes = -combine[0, count + 1 :]
     return combine, shares, changes, unlike
 
 

@@ -29,12 +29,15 @@ LIKE_A_PLACE = 0.42
 COARSE = 12
 """Frequencies of the coarse correlation."""
 
-_COLUMNS, _ROWS, _COLOR_ROWS = 80, 16, 8
+_COLUMNS = 80
+_ROWS = 16
+_COLOR_ROWS = 8
 # Standard deviation of the blur that removes light and its slow changes, of the columns: 10 deg.
 _BLUR = 1 / 37.5
 # Added to the brightness (8 bit) and to the standard deviation of its logarithm: the noise of dark
 # and of plain surfaces stays small beside texture.
-_DARKEST, _FLATTEST = 8.0, 0.1
+_DARKEST = 8.0
+_FLATTEST = 0.1
 # Quantization of textures to one byte: steps per standard deviation.
 _STEPS = 127 / 4.0
 

@@ -40,7 +40,9 @@ def derivatives(texture: Texture, channels: Sequence[slice], sphere: Sphere) -> 
     """Derivatives of a texture (rows, columns) by roll and pitch, (2, rows, columns) per rad;
     each of the `channels`, which are rows, is a panorama.
     """
-    columns, upward, elevations = texture.shape[1], [], []
+    columns = texture.shape[1]
+    upward = []
+    elevations = []
     for part in channels:
         elevations.append(sphere.elevations(part.stop - part.start))
         step = (sphere.low - sphere.high) / len(elevations[-1])
@@ -48,8 +50,10 @@ def derivatives(texture: Texture, channels: Sequence[slice], sphere: Sphere) -> 
     sideways = np.roll(texture, -1, 1) - np.roll(texture, 1, 1)
     sideways = sideways * np.tan(np.concatenate(elevations))[:, None]
     sideways *= (-1 if sphere.clockwise else 1) * columns / (4 * np.pi)
-    azimuth, up = sphere.azimuths(columns), np.concatenate(upward)
-    sin, cos = np.sin(azimuth), np.cos(azimuth)
+    azimuth = sphere.azimuths(columns)
+    up = np.concatenate(upward)
+    sin = np.sin(azimuth)
+    cos = np.cos(azimuth)
     return np.stack([up * sin - sideways * cos, -sideways * sin - up * cos])
 
 
@@ -69,7 +73,8 @@ def find_tilt(
     panorama each, of the first one the most. All tilts up to 12 degrees in steps of one row are
     tried: the correlation of an image with a tilt is a sum over the columns, each moved up or down.
     """
-    rows, count = channels[0].stop, len(others)
+    rows = channels[0].stop
+    count = len(others)
     # Rows of a channel with fewer of them are as many finer ones.
     fine = [part.start + np.arange(rows) * (part.stop - part.start) // rows for part in channels]
     level = columns_of(turned(others, turn)[:, np.stack(fine)], columns)

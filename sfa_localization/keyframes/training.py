@@ -18,16 +18,20 @@ from sfa_localization.keyframes.keyframes import FEWEST, Keyframes
 from sfa_localization.keyframes.regression import BORDER, Fit
 from sfa_localization.keyframes.texture import LIKE_A_PLACE, columns_of
 
-LEAST, DENSITY = 2000, 2
+LEAST = 2000
+DENSITY = 2
 """Keyframes of a model, 3 kB each: so many, or in large places so many per square meter. A third of
 them does as well on 16 m x 18 m; smaller places show nearer things."""
 # Keyframes are left out at so many places, and so many neighbors at each, whose errors are
 # correlated.
-_STRETCHES, _OF_EACH = 130, 3
+_STRETCHES = 130
+_OF_EACH = 3
 # Keyframes of a drive that are compared with those of others, and the least number. Lights differ
 # where this part of images, by squares, is a residual that is the same everywhere: 0.03 to 0.1
 # between day, morning and overcast, 0.005 at most in the same light.
-_COMPARED, _FEWEST, _OF_LIGHT = 60, 20, 0.01
+_COMPARED = 60
+_FEWEST = 20
+_OF_LIGHT = 0.01
 
 
 def choose_keyframes(
@@ -44,7 +48,8 @@ def choose_keyframes(
     The keyframes, and which images (K,) they are. Raises DataError for too few images.
     """
     cells, cell = np.unique(np.floor(poses[:, :2]), axis=0, return_inverse=True)
-    number, cell = max(LEAST, DENSITY * len(cells)), cell.reshape(-1)
+    number = max(LEAST, DENSITY * len(cells))
+    cell = cell.reshape(-1)
     order = np.random.default_rng(0).permutation(len(poses))
     order = order[np.argsort(cell[order], kind='stable')]
     rank = np.arange(len(order)) - np.searchsorted(cell[order], cell[order])
@@ -62,7 +67,9 @@ def located_without(
     (M,) m of the nearest of these. `path_m` (K,) is the distance driven until each keyframe.
     """
     first = evenly(len(keyframes.poses), _STRETCHES)[:, None] + np.arange(_OF_EACH)
-    rows, fits, nearest = list[int](), list[Fit](), list[float]()
+    rows = list[int]()
+    fits = list[Fit]()
+    nearest = list[float]()
     for row in np.unique(first[first < len(keyframes.poses)]).tolist():
         others = np.abs(path_m - path_m[row]) >= STRETCH_M
         fit = fit_among(keyframes, row, others)
@@ -78,7 +85,8 @@ def fit_among(keyframes: Keyframes, row: int, among: NDArray[np.bool_]) -> Fit |
     """The fit of a keyframe among others, by a mask (K,); None where it is like none of them, or
     they are too few.
     """
-    image, others = keyframes.spectrum(row), keyframes.take(among)
+    image = keyframes.spectrum(row)
+    others = keyframes.take(among)
     if len(others.poses) < FEWEST:
         return None
     part = image
@@ -88,7 +96,8 @@ def fit_among(keyframes: Keyframes, row: int, among: NDArray[np.bool_]) -> Fit |
     best = int(scores.argmax())
     if scores[best] < LIKE_A_PLACE:
         return None
-    place, yaw = others.poses[best, :2], float(yaws[best])
+    place = others.poses[best, :2]
+    yaw = float(yaws[best])
     lights = others.likeliest_lights(scores)
     fits = [others.fit_about(image, place, yaw, light) for light in lights]
     return min(fits, key=lambda fit: fit.unlike, default=None)
@@ -96,7 +105,8 @@ def fit_among(keyframes: Keyframes, row: int, among: NDArray[np.bool_]) -> Fit |
 
 def _by_light(keyframes: Keyframes) -> Keyframes:
     """With one number for all drives in the same light: together they are nearer to any place."""
-    lights, count = np.full(len(keyframes.drives), -1, np.int32), 0
+    lights = np.full(len(keyframes.drives), -1, np.int32)
+    count = 0
     for drive in np.unique(keyframes.drives).tolist():
         rows = np.flatnonzero(keyframes.drives == drive)
         shares = [_of_light(keyframes, rows, lights == light) for light in range(count)]

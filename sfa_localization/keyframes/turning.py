@@ -20,9 +20,11 @@ from sfa_localization.keyframes.closures import Textures
 from sfa_localization.keyframes.hidden import turned_mask
 from sfa_localization.keyframes.texture import Spectra, columns_of, correlate, spectra_of, turned
 
-SPOT_M, TURNS_RAD = 0.02, (0.3, 1.5)
+SPOT_M = 0.02
+TURNS_RAD = (0.3, 1.5)
 """The two images of a turn are so near to each other, and turned by so much."""
-AHEAD_M, STRAIGHT_RAD = (0.05, 0.65), 0.08
+AHEAD_M = (0.05, 0.65)
+STRAIGHT_RAD = 0.08
 """Way and turn between two images that show what a way changes."""
 FREQUENCIES = 10
 """Number of low frequencies compared: they change with the square of the distance, and do not
@@ -32,7 +34,10 @@ UNSURE = 0.5
 it should be, in five drives)."""
 # Pairs of images are up to so many images apart; so many pairs at most, and at least, in so many
 # groups.
-_LAGS, _MOST, _FEWEST, _GROUPS = 13, 2000, 30, 6
+_LAGS = 13
+_MOST = 2000
+_FEWEST = 30
+_GROUPS = 6
 
 
 def lever_square(views: Textures, yaw: Array) -> Quantity | None:
@@ -43,7 +48,8 @@ def lever_square(views: Textures, yaw: Array) -> Quantity | None:
     first = np.concatenate([np.arange(len(yaw) - lag) for lag in lags])
     last = np.concatenate([np.arange(lag, len(yaw)) for lag in lags])
     same = views.run[first] == views.run[last]
-    way, turn = views.path_m[last] - views.path_m[first], np.abs(yaw[last] - yaw[first])
+    way = views.path_m[last] - views.path_m[first]
+    turn = np.abs(yaw[last] - yaw[first])
     spot = same & (way < SPOT_M) & (turn > TURNS_RAD[0]) & (turn < TURNS_RAD[1])
     ahead = same & (turn < STRAIGHT_RAD) & (way > AHEAD_M[0]) & (way < AHEAD_M[1])
     if min(spot.sum(), ahead.sum()) < _FEWEST:
@@ -52,11 +58,14 @@ def lever_square(views: Textures, yaw: Array) -> Quantity | None:
     turned = _medians(views, first[spot], last[spot], chord)
     driven = _medians(views, first[ahead], last[ahead], way[ahead] ** 2)
     rows = np.zeros((2 * _GROUPS, 3))
-    rows[:, 0], rows[:_GROUPS, 1], rows[_GROUPS:, 2] = 1, turned[:, 0], driven[:, 0]
+    rows[:, 0] = 1
+    rows[:_GROUPS, 1] = turned[:, 0]
+    rows[_GROUPS:, 2] = driven[:, 0]
     changes = np.concatenate([turned[:, 1], driven[:, 1]])
     solution = np.linalg.lstsq(rows, changes, rcond=None)[0]
     _, by_turn, by_way = solution.tolist()
-    residual, spread = (changes - rows @ solution)[:_GROUPS], np.var(turned[:, 0]) * _GROUPS
+    residual = (changes - rows @ solution)[:_GROUPS]
+    spread = np.var(turned[:, 0]) * _GROUPS
     std = np.sqrt(residual @ residual / (_GROUPS - 2) / max(float(spread), 1e-12))
     return Quantity(max(by_turn, 0.0) / by_way, float(std) / by_way) if by_way > 0 else None
 
@@ -67,8 +76,11 @@ def _medians(views: Textures, first: Indices, last: Indices, size: Array) -> Arr
     most alike.
     """
     rows = evenly(len(size), _MOST)
-    first, last, size = first[rows], last[rows], size[rows]
-    textures, columns = views.textures, views.textures.shape[2]
+    first = first[rows]
+    last = last[rows]
+    size = size[rows]
+    textures = views.textures
+    columns = views.textures.shape[2]
     used, pairs = np.unique([first, last], return_inverse=True)
     low = spectra_of(textures[used])
     low[:, :, [0, *range(FREQUENCIES + 1, low.shape[2])]] = 0
@@ -90,10 +102,12 @@ def _likeness(first: Spectra, last: Spectra, columns: int, seen: Mask | None) ->
     (score,), (shift,) = correlate(first, last, columns)
     if seen is None:
         return float(score)
-    image, best = columns_of(first, columns), 0.0
+    image = columns_of(first, columns)
+    best = 0.0
     for angle in (shift + np.arange(-2, 2.1, 0.5)) * (2 * np.pi / columns):
         other = columns_of(turned(last, np.array([angle])), columns)[0]
         mask = seen & turned_mask(seen, angle)
-        a, b = image[mask], other[mask]
+        a = image[mask]
+        b = other[mask]
         best = max(best, float(a @ b / np.sqrt(max((a @ a) * (b @ b), 1e-18))))
     return best

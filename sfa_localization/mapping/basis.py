@@ -49,7 +49,8 @@ class Monomials:
     def fit(cls, features: Array, count: int, ridge: float) -> Monomials:
         """On features (M, >= count); `ridge` penalizes the weights of standardized monomials."""
         terms = monomials(features[:, :count])[:, 1:]
-        center, spread = terms.mean(0), terms.std(0)
+        center = terms.mean(0)
+        spread = terms.std(0)
         spread = np.where(spread > 0, spread, 1.0)
         _, s, vt = np.linalg.svd((terms - center) / spread, full_matrices=False)
         kept = s > 1e-10 * s[0]
@@ -124,7 +125,8 @@ class Process:
         return matern(features[:, : len(self.scale)] * self.scale, self.points)
 
     def to_arrays(self) -> Arrays:
-        points, noise = self.points.astype(np.float32), np.array(self.noise)
+        points = self.points.astype(np.float32)
+        noise = np.array(self.noise)
         return {'scale': self.scale, 'points': points, 'noise': noise}
 
 

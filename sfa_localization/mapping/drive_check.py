@@ -25,7 +25,8 @@ ROUTE = (
     'beside it; cross earlier tracks to learn an area'
 )
 # Fewer directions leave any shear possible; narrower drives do not cover an area.
-_SEGMENTS_MIN, _WIDTH_MIN_M = 3, 0.5
+_SEGMENTS_MIN = 3
+_WIDTH_MIN_M = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +69,10 @@ def check_amount(stack: Stack, links: Links) -> None:
 
 def diagnose(fit: MapFit) -> Diagnostics:
     """Diagnostics of a fit."""
-    places, stack = fit.places, fit.stack
-    lengths, same = stack.sums(stack.steps), np.diff(stack.owner, prepend=-1) == 0
+    places = fit.places
+    stack = fit.stack
+    lengths = stack.sums(stack.steps)
+    same = np.diff(stack.owner, prepend=-1) == 0
     heading = (np.diff(stack.path, prepend=0.0) * fit.graph.poses.z[stack.owner])[same]
     return Diagnostics(
         segments=stack.segments,
@@ -120,7 +123,8 @@ def _crossings(places: Complex, first: Indices) -> int:
     neighbors.
     """
     ends = np.append(first[1:], len(places)) - 1
-    a, b = places[first], places[ends]
+    a = places[first]
+    b = places[ends]
     i, j = np.triu_indices(len(a), 2)
 
     def side(p: Complex, q: Complex, r: Complex) -> Array:

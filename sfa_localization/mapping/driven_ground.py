@@ -61,7 +61,9 @@ class DrivenGround:
 
     def cells(self, config: GroundConfig) -> Cells:
         """The cells that a robot of some width covered."""
-        size_m, reach_m, ends = config.cell, config.width / 2, self.places[self.lines]
+        size_m = config.cell
+        reach_m = config.width / 2
+        ends = self.places[self.lines]
         part = np.linspace(0.0, 1.0, int(np.ceil(_JOINED_M / size_m)) + 1)[:, None]
         between = ends[:, :1] + part * (ends[:, 1:] - ends[:, :1])
         points = np.concatenate([self.places, between.reshape(-1, 2)])

@@ -46,7 +46,8 @@ _POINT_ROUNDS = 3
 """Points straighten the map, which may show other points to be right."""
 SCALE_STD = 0.01
 """Of a map whose meters are those of the wheels."""
-_MOUNT_ROUNDS, _MOUNT_SETTLED_M = 4, 0.02
+_MOUNT_ROUNDS = 4
+_MOUNT_SETTLED_M = 0.02
 """Offsets are measured again until the camera's place moves by less than their error."""
 _LOSS_ROUNDS = 2
 """The first map underestimates the loss in turns by a third, the next one by a tenth."""
@@ -115,7 +116,8 @@ class Drives:
 
         Raises DataError.
         """
-        ways, mount = ways or [None] * len(self.items), self.mount.of(len(self.items))
+        ways = ways or [None] * len(self.items)
+        mount = self.mount.of(len(self.items))
         parts = []
         for track, way, drive in zip(self.tracks(), ways, self.items, strict=True):
             track = replace(track.driven(way) if way else track, lever=mount.lever)
@@ -142,7 +144,8 @@ class Drives:
         headings = self._headings(self.tracks())
         turns = np.concatenate([each.track for each in headings])[views.images]
         mount = replace(self.mount, turning=lever_square(views, turns))
-        drives, count = replace(self, mount=mount), int(views.images.max()) + 1
+        drives = replace(self, mount=mount)
+        count = int(views.images.max()) + 1
         drives = replace(drives, offsets=rough_offsets(drives.cut().closures))
         for _ in range(_MOUNT_ROUNDS):
             before = drives.mount
@@ -177,7 +180,8 @@ class Drives:
 
         All change their length by one factor: single drives do not show it better.
         """
-        ways, longer = list[Way | None](), list[float]()
+        ways = list[Way | None]()
+        longer = list[float]()
         for track, images, before in zip(
             self.tracks(), self.image_poses(result), segments.ways, strict=True
         ):
@@ -196,7 +200,8 @@ class Drives:
 
 def rig_of(drives: Drives, segments: Segments) -> Rig:
     """What was learned of the robot."""
-    usual, delays = Rig(), [d.delay_ns * 1e-9 for d in drives.items if d.delay_ns is not None]
+    usual = Rig()
+    delays = [d.delay_ns * 1e-9 for d in drives.items if d.delay_ns is not None]
     ways = [way or Way(1.0, usual.turn_loss, usual.speed_offset) for way in segments.ways]
     turn_factor = _together(drives.turn_factors() or [Quantity(1.0, 0.0)])
     scale_std = segments.points.settled.scale_std if segments.points else SCALE_STD
@@ -241,7 +246,8 @@ def learn_map(
             break
         try:
             corrected = drives.cut(ways)
-            segments, result = corrected, learn_metric(features, corrected, config, seed)
+            segments = corrected
+            result = learn_metric(features, corrected, config, seed)
         except DataError as error:
             logger.warning('the way that wheels lose in turns stays in the map: %s', error)
             break
@@ -261,7 +267,8 @@ def with_points(
     """
     for _ in range(_POINT_ROUNDS if segments.points else 0):
         assert segments.points is not None
-        before, result = segments.points.settled, maps[-1]
+        before = segments.points.settled
+        result = maps[-1]
         now = settle(segments.points, result.points, result.points_covariance)
         if (now.used == before.used).all():
             break

@@ -57,7 +57,8 @@ def metric_map(fit: MapFit, frame: RigidTransform, inflation: float, common_m: f
     """The map of a fit in the map frame, with the covariance of its weights."""
     weights = np.exp(1j * frame.yaw_rad) * fit.map_weights
     weights[-1] += frame.x_m + 1j * frame.y_m
-    root, noise_m = fit.ridge.root.T, float(np.sqrt(fit.variance))
+    root = fit.ridge.root.T
+    noise_m = float(np.sqrt(fit.variance))
     return MetricMap.of(fit.ridge.basis, plane(weights), root, noise_m, inflation, common_m)
 
 
@@ -67,14 +68,17 @@ def map_frame(fit: MapFit) -> RigidTransform:
     The map frame is the odometry frame at the start of the first run; with a `start_pose`, that run
     starts there. Measured points come first.
     """
-    start, measured = _start_frame(fit), fit.problem.segments.points
+    start = _start_frame(fit)
+    measured = fit.problem.segments.points
     return start if measured is None else measured.frame(places_of_points(fit)[0], start)
 
 
 def _start_frame(fit: MapFit) -> RigidTransform:
     """By the odometry at the start of the first run, each image weighted by how little the odometry
     can have drifted until then, or by the pose that the run is to have."""
-    segments, stack, pose = fit.problem.segments, fit.stack, fit.problem.config.start_pose
+    segments = fit.problem.segments
+    stack = fit.stack
+    pose = fit.problem.config.start_pose
     starts, variances = _odometry(fit)
     rows = np.flatnonzero(stack.owner < len(starts))
     x, y, yaw = starts[stack.owner[rows]].T
@@ -91,7 +95,8 @@ def _start_frame(fit: MapFit) -> RigidTransform:
 def _odometry(fit: MapFit) -> tuple[Array, Array]:
     """Poses (n, 3) of the first segments by odometry without the biases, up to the first break, and
     the variances (n,) of their places."""
-    links, stack = fit.problem.links, fit.stack
+    links = fit.problem.links
+    stack = fit.stack
     unbroken = np.cumprod(links.at == np.arange(len(links.at))).astype(bool)
     bias = fit.graph.poses.bias[stack.period[links.at]]
     turned = (links.turn_rad - bias * links.turn_time_s)[unbroken]

@@ -23,7 +23,8 @@ from sfa_localization.data.geometry import Array, Indices, RigidTransform
 REACH_M = 1.0
 """Ground farther than this from every image is not covered by the drive."""
 # Points on the ground, and bins of their distances.
-_POINTS, _BINS = 1000, 12
+_POINTS = 1000
+_BINS = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +81,8 @@ def ground_distances(places: Array, rng: np.random.Generator) -> Array:
     centered = places - places.mean(0)
     local = centered @ np.linalg.svd(centered, full_matrices=False)[2].T
     hull = ConvexHull(local, qhull_options='QJ').equations  # also of a straight line
-    tree, distances = cKDTree(local), np.zeros(0)
+    tree = cKDTree(local)
+    distances = np.zeros(0)
     while len(distances) < _POINTS:
         points = rng.uniform(local.min(0), local.max(0), (4 * _POINTS, 2))
         inside = np.all(points @ hull[:, :2].T + hull[:, 2] <= 1e-6, axis=1)

@@ -56,17 +56,21 @@ def learn_keyframes(
     """Keyframes of the images of `views`, where the segments put them; along the drive a turn
     counts as `turn_radius_m` per rad. Raises DataError for too few images."""
     _, seen, row = np.intersect1d(views.images, result.images, return_indices=True)
-    poses, drives = result.poses[row], views.run[seen].astype(np.int32)
+    poses = result.poses[row]
+    drives = views.run[seen].astype(np.int32)
     keyframes, kept = choose_keyframes(views.textures[seen], poses, sphere, drives, views.seen)
-    path, rows = _along_tracks(views, segments)[seen][kept], row[kept]
+    path = _along_tracks(views, segments)[seen][kept]
+    rows = row[kept]
     tried, fits, near_m = located_without(keyframes, path)
     shared = {'map_m': result.map.common_m, 'turn_std': usual_turn_std(result.angle_covariance)}
     if len(tried) < _ENOUGH:
         return KeyframeMap(replace(keyframes, errors=replace(ErrorModel(), **shared)))
-    poses, rows = keyframes.poses[tried], rows[tried]
+    poses = keyframes.poses[tried]
+    rows = rows[tried]
     ground_m = ground_distances(keyframes.poses[:, :2], np.random.default_rng(0))
     trials = LeftOut.of(fits, poses, importance(near_m, ground_m))
-    slow, claimed = result.held_out[rows], result.held_out_variance[rows]
+    slow = result.held_out[rows]
+    claimed = result.held_out_variance[rows]
     errors = trials.learn_slow(trials.learn(), slow, claimed)
     both, variance = trials.fused(errors, slow, claimed)
     weight, driven, owner = trials.weight, *_driven(segments, turn_radius_m)

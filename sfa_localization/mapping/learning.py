@@ -46,7 +46,8 @@ from sfa_localization.sfa.image_features import Spectrum
 
 logger = logging.getLogger(__name__)
 
-LITTLE, OVERFIT = 0.9, 4.0
+LITTLE = 0.9
+OVERFIT = 4.0
 """Where features explain less than this share of the places of images held out, whose variance is
 so many times that of the others, a map follows noise: it leaves no residuals, and would bend the
 drive as it likes. Then the drive keeps the shape of its odometry."""
@@ -176,7 +177,8 @@ def _result(
     inflation = held.inflation
     drive_std = np.sqrt(inflation) * held.forecast.drive_std
     common_m = float(np.sqrt((drive_std**2).mean() / 2))
-    turn, shift = np.exp(1j * frame.yaw_rad), frame.x_m + 1j * frame.y_m
+    turn = np.exp(1j * frame.yaw_rad)
+    shift = frame.x_m + 1j * frame.y_m
     points, points_covariance = places_of_points(fit)
     yaw = fit.stack.yaws(fit.graph.poses)
     return MetricResult(
@@ -205,7 +207,8 @@ def learn_turned(
     """Learn a map of the spectra (N, H, J) of all images, turned by the certified headings of the
     first map of the same segments, and in its frame. Raises DataError as ``learn_metric``.
     """
-    images, yaw = first.images, first.poses[:, 2]
+    images = first.images
+    yaw = first.poses[:, 2]
     rows = evenly(len(images), _COMPONENT_IMAGES)
     turned = TurnedMaps.fit(spectra[images[rows]], yaw[rows], sign)
     features = np.zeros((len(spectra), turned.axes.shape[1]))

@@ -36,7 +36,8 @@ _FIRST_VARIANCE = 0.04
 # Least standard deviation of odometry paths.
 _NOISE_MIN_M = 1e-3
 # Rounds, and the relative change of the variance of images that ends them.
-_ROUNDS, _SETTLED = 8, 0.01
+_ROUNDS = 8
+_SETTLED = 0.01
 # Residuals so many images apart are taken as independent.
 _LAGS = 50
 
@@ -136,7 +137,8 @@ def _form(stack: Stack, links: Links, gram: Complex, image_variance: float) -> A
 
 def _alternated(problem: MetricProblem, ridge: Ridge, start: MapFit | None, rounds: int) -> MapFit:
     """Estimate poses and noise in turn until the noise settles."""
-    stack, gram = problem.stack, ridge.gram(problem.stack)
+    stack = problem.stack
+    gram = ridge.gram(problem.stack)
     poses = start.graph.poses if start else None
     links = start.links if start else problem.links
     variance = start.variance if start else _FIRST_VARIANCE
@@ -145,7 +147,8 @@ def _alternated(problem: MetricProblem, ridge: Ridge, start: MapFit | None, roun
     for _ in range(rounds):
         graph = Graph.solved(_form(stack, links, gram, image_variance), stack, poses)
         fit = MapFit.of(problem, ridge, graph, links, image_variance, freedom)
-        poses, links = graph.poses, graph.learned(problem.links, links)
+        poses = graph.poses
+        links = graph.learned(problem.links, links)
         steady = abs(fit.variance - variance) < _SETTLED * fit.variance
         variance = fit.variance
         image_variance = LINK_WEIGHT * variance * _correlation(fit.residuals, stack)

@@ -55,7 +55,8 @@ class Lines:
 
     def gradient(self, theta: Complex) -> Complex:
         """By alpha: eq. 2, or eq. 6 with turns; by o: eq. 3; by W: eq. 4."""
-        alpha, misfit = self.parts(theta)[0], self._misfit(theta)
+        alpha = self.parts(theta)[0]
+        misfit = self._misfit(theta)
         lever = self.distances * np.imag(np.exp(-1j * alpha)[self.line] * misfit)
         by_alpha, by_x, by_y = (
             np.asarray(np.bincount(self.line, pull, len(alpha)), float)
@@ -92,7 +93,9 @@ def descend(
     Returns theta and the cost (I,) before each iteration and after the last. Raises DataError when
     the descent diverges.
     """
-    theta, velocity, history = start, np.zeros_like(start), [lines.cost(start)]
+    theta = start
+    velocity = np.zeros_like(start)
+    history = [lines.cost(start)]
     for _ in range(iterations):
         velocity = momentum * velocity + learning_rate * lines.gradient(theta)
         theta = theta - velocity
@@ -104,7 +107,8 @@ def descend(
 
 def odometry_start(lines: Lines, starts: Array) -> Complex:
     """The paper's start on the robot: lines (N, 3) of odometry, weights regressed on them."""
-    origins, alpha = starts[:, 0] + 1j * starts[:, 1], starts[:, 2]
+    origins = starts[:, 0] + 1j * starts[:, 1]
+    alpha = starts[:, 2]
     placed = origins[lines.line] + lines.distances * np.exp(1j * alpha)[lines.line]
     weights = np.linalg.lstsq(lines.regressors, placed, rcond=None)[0]
     return np.concatenate([alpha, origins, weights])
@@ -121,7 +125,8 @@ def learn(problem: MetricProblem) -> MapFit:
 
     Raises DataError when the segments are not straight lines, as the paper's costs assume.
     """
-    stack, links = problem.stack, problem.links
+    stack = problem.stack
+    links = problem.links
     if np.any(stack.path.imag):
         raise DataError('the paper solver needs straight lines: set segments: straight')
     count = min(problem.config.slow_features or PAPER_FEATURES, problem.features.shape[1])
@@ -139,7 +144,8 @@ def learn(problem: MetricProblem) -> MapFit:
 
 def _fit(lines: Lines, theta: Complex, count: int, problem: MetricProblem) -> MapFit:
     """The result of the descent as a fit, with the certificate of the minimum that is near."""
-    stack, terms = problem.stack, lines.regressors.shape[1]
+    stack = problem.stack
+    terms = lines.regressors.shape[1]
     basis = Monomials(np.zeros(terms - 1), np.eye(terms - 1), np.zeros(terms), count)
     ridge = Ridge.of(basis, problem.features)
     alpha, origins, weights = lines.parts(theta)

@@ -48,7 +48,8 @@ class Ridge:
 
     def without(self, rows: Indices) -> Ridge:
         """From the other images."""
-        removed, weights = self.expanded[rows], self.weights.copy()
+        removed = self.expanded[rows]
+        weights = self.weights.copy()
         normal = self.normal - (removed * weights[rows, None]).T @ removed
         weights[rows] = 0.0
         return Ridge(self.basis, self.expanded, weights, normal, _cholesky(normal))

@@ -102,7 +102,8 @@ class MetricMap:
         """The map of saved arrays. Raises ModelError where one is missing."""
         try:
             scalars = np.asarray(arrays['scalars'], float).tolist()
-            factor, basis = unpacked(arrays['factor']).astype(float), basis_from(arrays)
+            factor = unpacked(arrays['factor']).astype(float)
+            basis = basis_from(arrays)
             return cls(basis, arrays['linear'], arrays['constant'], factor, *scalars)
         except KeyError as error:
             raise ModelError(f'the metric map lacks {error}') from None

@@ -99,11 +99,14 @@ def hold_out(fit: MapFit) -> HeldOut:
     The segments of the part keep their odometry, which keeps the frame. Predictions are compared
     with the places by all data.
     """
-    stack, places = fit.stack, fit.places
-    errors, variances = np.zeros(len(places), complex), np.zeros(len(places))
+    stack = fit.stack
+    places = fit.places
+    errors = np.zeros(len(places), complex)
+    variances = np.zeros(len(places))
     for rows in _parts(fit):
         ridge, poses = fit.without(rows)
-        others, expanded = poses.places(stack), fit.ridge.expanded[rows]
+        others = poses.places(stack)
+        expanded = fit.ridge.expanded[rows]
         turn, shift = align_complex(others, places, ridge.weights)
         errors[rows] = places[rows] - (turn * (expanded @ ridge.fitted(others)) + shift)
         by_weights = (ridge.whitened(expanded) ** 2).sum(0)
@@ -121,11 +124,15 @@ def evidence(basis: Basis, now: MapFit) -> float:
 
     Origins have flat priors (restricted likelihood); the signal's variance is profiled out.
     """
-    ridge, noise, stack = Ridge.of(basis, now.problem.features), float(basis.ridge[0]), now.stack
-    form, segments = now.form(ridge), stack.segments
+    ridge = Ridge.of(basis, now.problem.features)
+    noise = float(basis.ridge[0])
+    stack = now.stack
+    form = now.form(ridge)
+    segments = stack.segments
     squares = now.image_variance * cost(form, refined(form, stack, now.graph.poses), stack)
     origins = now.image_variance * form[:segments, :segments].real
-    points, freedom = len(ridge.expanded), len(ridge.expanded) - segments
+    points = len(ridge.expanded)
+    freedom = len(ridge.expanded) - segments
     return (
         freedom * float(np.log(squares / noise / freedom))
         + (points - len(basis.ridge) + 1 - segments) * float(np.log(noise))
@@ -138,7 +145,8 @@ def evidence(basis: Basis, now: MapFit) -> float:
 def on_the_ground(fit: MapFit) -> tuple[Array, Array]:
     """Distances (K,) m of the covered ground to the nearest image, and the weights (M,) by which
     held-out images represent it."""
-    places, seed = plane(fit.places), fit.problem.seed
+    places = plane(fit.places)
+    seed = fit.problem.seed
     distances = ground_distances(places, np.random.default_rng(seed))
     return distances, importance(nearest_used(places, folds(fit.stack, seed)), distances)
 
@@ -148,7 +156,8 @@ def held_out_error(basis: Basis, now: MapFit, weight: Array) -> float:
 
     The evidence would mistake correlated errors of neighbors for low noise.
     """
-    ridge, places = Ridge.of(basis, now.problem.features), now.places
+    ridge = Ridge.of(basis, now.problem.features)
+    places = now.places
     return sum(
         float(weight[rows] @ np.abs(places[rows] - predicted))
         for rows in _parts(now)
@@ -161,7 +170,8 @@ def feature_scale(features: Array, stack: Stack, count: int) -> Array:
     typical distance of two images."""
     chosen = features[:, :count]
     same = stack.owner[1:] == stack.owner[:-1]
-    variance, std = chosen.var(axis=0), chosen.std(axis=0)
+    variance = chosen.var(axis=0)
+    std = chosen.std(axis=0)
     delta = np.mean(np.diff(chosen, axis=0)[same] ** 2, axis=0)
     delta = np.maximum(delta / np.where(variance > 0, variance, 1.0), 1e-12)
     weights = delta**-0.25
@@ -175,7 +185,8 @@ def choose(problem: MetricProblem, scale: Array | None = None) -> MapFit:
 
     `scale` (K,) weights the features of a Gaussian process; without it, their slowness does.
     """
-    available, asked = problem.features.shape[1], problem.config.slow_features
+    available = problem.features.shape[1]
+    asked = problem.config.slow_features
     if problem.config.metric_map == 'monomials':
         count = asked or min(PAPER_FEATURES, available)
         return problem.fit(Monomials.fit(problem.features, count, RIDGE))

@@ -32,7 +32,8 @@ DIMENSIONS = 32
 """Principal components that the map reads."""
 # Three sigma points of an uncertain heading, in standard deviations, and their weights: those of an
 # unknown heading are a third of a turn from each other.
-_SIGMA_POINTS, _WEIGHTS = np.array([0.0, 1.0, -1.0]) * 2 / np.sqrt(3), np.array([2.0, 3.0, 3.0]) / 8
+_SIGMA_POINTS = np.array([0.0, 1.0, -1.0]) * 2 / np.sqrt(3)
+_WEIGHTS = np.array([2.0, 3.0, 3.0]) / 8
 
 
 def turned_back(spectra: Spectrum, yaw: Array, sign: float) -> Vectors:
@@ -62,7 +63,8 @@ class TurnedMaps:
         vectors = turned_back(spectra, yaw, sign)
         mean = vectors.mean(0, dtype=np.float64).astype(np.float32)
         centered = vectors - mean
-        size, count = len(centered), min(DIMENSIONS, len(centered) - 1, vectors.shape[1])
+        size = len(centered)
+        count = min(DIMENSIONS, len(centered) - 1, vectors.shape[1])
         gram = (centered @ centered.T).astype(np.float64)
         power, sides = linalg.eigh(gram, subset_by_index=(size - count, size - 1))
         kept = power > 1e-6 * max(float(power[-1]), 1e-30)

@@ -57,7 +57,9 @@ class Links:
     def rows(self, stack: Stack) -> tuple[Any, Any]:
         """Rows (L, 3N) whose products with [o, z, -b z] are the residuals of turns, and the same of
         displacements."""
-        n, at, ones = stack.segments, self.at, np.ones(len(self.at))
+        n = stack.segments
+        at = self.at
+        ones = np.ones(len(self.at))
         turn = -np.exp(1j * self.turn_rad)
         turns = (n + at + 1, ones), (n + at, turn), (2 * n + at, 1j * self.turn_time_s * turn)
         moved = (n + at, -self.displacement), (2 * n + at, -self.displacement_drift)
@@ -103,7 +105,8 @@ def _grown(
     A solution with `assumed` variances has `squares` of residuals, and is `uncertain` of them.
     """
     freedom = np.bincount(run, 1.0 - np.minimum(uncertain / assumed, 1.0)) + _PRIOR_LINKS
-    error, misfit = (squares + uncertain) / stated, squares / stated
+    error = (squares + uncertain) / stated
+    misfit = squares / stated
     factor = np.ones(len(freedom))
     for _ in range(_STEPS):
         outlier = outlier_factor(axes * error / factor[run], axes)

@@ -31,8 +31,13 @@ from sfa_localization.motion.dead_reckoning import summed
 
 # Standard deviations, rad and m per axis, which grow with `Offsets.unlike`, that of closures, and
 # the least factor on them.
-_TURN_STD, _PLACE_STD_M, _ALIKE, _CLOSURE_UNLIKE, _LEAST = 0.005, 0.65, 0.03, 0.5, 0.2
-_DRIFT_M, _DRIFT = 1.0, 0.1
+_TURN_STD = 0.005
+_PLACE_STD_M = 0.65
+_ALIKE = 0.03
+_CLOSURE_UNLIKE = 0.5
+_LEAST = 0.2
+_DRIFT_M = 1.0
+_DRIFT = 0.1
 """Bound of the odometry's error: this many m plus this share of the distance driven (slipping
 wheels: 5 %)."""
 
@@ -56,11 +61,13 @@ class Loops:
     @classmethod
     def of(cls, offsets: Offsets, stack: Stack) -> Loops:
         """Of the images of segments."""
-        row, others = stack.rows(offsets.images), stack.rows(offsets.others)
+        row = stack.rows(offsets.images)
+        others = stack.rows(offsets.others)
         shares = np.where(others >= 0, offsets.shares, 0.0)
         whole = shares.sum(axis=1)
         kept = (row >= 0) & (np.abs(whole - 1.0) < _LEAST)
-        shares, unlike = shares[kept] / whole[kept, None], offsets.unlike[kept]
+        shares = shares[kept] / whole[kept, None]
+        unlike = offsets.unlike[kept]
         rows = _squares(row[kept], others[kept], shares, offsets.turn[kept], stack)
         place_std = _PLACE_STD_M * np.hypot(_ALIKE, unlike)
         alike = ErrorCorrelation().alike(np.cumsum(stack.steps)[row[kept]])
@@ -75,7 +82,8 @@ class Loops:
     def by_mount(self, stack: Stack, before: SegmentPoses | None, poses: SegmentPoses) -> Complex:
         """Derivative (2 L, 4 + D) of these residuals by the mount (mount.py): by its lever arm, m,
         slip, and its yaw in each of D drives, rad."""
-        y, count = poses.coefficients(stack.period), len(self.share)
+        y = poses.coefficients(stack.period)
+        count = len(self.share)
         lever = self.facing @ y
         slip = lever - self.along @ y
         columns = np.zeros((2 * count, 5 + int(stack.run.max())), complex)
@@ -86,13 +94,17 @@ class Loops:
 
     def _weights(self, stack: Stack, before: SegmentPoses | None) -> Array:
         """(2 L,) one over the standard deviations, by the residuals at the poses `before`."""
-        turn_std, place_std, outlier = self.turn_std, self.place_std, np.ones(len(self.share))
+        turn_std = self.turn_std
+        place_std = self.place_std
+        outlier = np.ones(len(self.share))
         if before is not None and len(outlier):
             y = before.coefficients(stack.period)
-            turned, missed = np.abs(self.turns @ y) / turn_std, np.abs(self.places @ y) / place_std
+            turned = np.abs(self.turns @ y) / turn_std
+            missed = np.abs(self.places @ y) / place_std
             turn_factor = max(MEDIAN_TO_STD * float(np.median(turned)), _LEAST)
             place_factor = max(LENGTH_TO_STD * float(np.median(missed)), _LEAST)
-            turn_std, place_std = turn_factor * turn_std, place_factor * place_std
+            turn_std = turn_factor * turn_std
+            place_std = place_factor * place_std
             squares = (turned / turn_factor) ** 2 + (missed / place_factor) ** 2
             outlier = outlier_factor(squares, 3)  # a turn and both axes of a place
         weights = np.sqrt(np.tile(self.share / outlier, 2))
@@ -103,7 +115,8 @@ def rough_offsets(closures: Closures) -> Offsets:
     """Closures without measured offsets, taken as 0 m: accurate enough to find the neighbors of
     images.
     """
-    images, turn = closures.images, closures.turn[:, None]
+    images = closures.images
+    turn = closures.turn[:, None]
     unlike = np.full(len(turn), _CLOSURE_UNLIKE)
     return Offsets(images[:, 1], images[:, :1], np.ones_like(turn), turn, unlike)
 
@@ -112,12 +125,15 @@ def _squares(
     row: Indices, others: Indices, shares: Array, turn: Array, stack: Stack
 ) -> tuple[Any, Any, Any, Any]:
     """`turns`, `places`, `facing` and `along` of a row (L,) of the stack among others (L, K)."""
-    rows, zeros = np.column_stack([row, others]), np.zeros(len(row))
+    rows = np.column_stack([row, others])
+    zeros = np.zeros(len(row))
     minus = np.column_stack([zeros + 1.0, -shares])
     turns = minus * np.exp(1j * (stack.headings[rows] + np.column_stack([zeros, turn])))
-    n, owner = stack.segments, stack.owner[rows]
+    n = stack.segments
+    owner = stack.owner[rows]
     turned = (n + owner, turns), (2 * n + owner, 1j * stack.times_s[rows] * turns)
-    places, facing = stack.place_rows(rows, minus), stack.facing_rows(rows, minus)
+    places = stack.place_rows(rows, minus)
+    facing = stack.facing_rows(rows, minus)
     return stack.sparse(*turned), places, facing, stack.sparse((n + owner, minus))
 
 
@@ -126,8 +142,10 @@ def with_closures(segments: Segments, closures: Closures) -> Segments:
     look alike.
     """
     stack = Stack.of(segments)
-    owner, (x, y, yaw) = stack.owner, stack.starts[stack.owner].T
-    places, driven = x + 1j * y + np.exp(1j * yaw) * stack.path, np.cumsum(stack.steps)
+    owner = stack.owner
+    (x, y, yaw) = stack.starts[stack.owner].T
+    places = x + 1j * y + np.exp(1j * yaw) * stack.path
+    driven = np.cumsum(stack.steps)
     # And the distance from the last image of a segment to the first one of the next.
     gaps = [np.nan_to_num(abs(s.displacement)) for s in segments] - stack.sums(stack.steps)
     driven += summed(np.maximum(gaps, 0.0))[owner]

@@ -86,8 +86,11 @@ class MeasuredPoints:
         covers its stamp. Points are places of base_link, or of an antenna at its lever arm, images
         those of a camera at a `lever` arm, ahead + i left, m.
         """
-        nearest, offset = np.full(len(points), -1), np.full(len(points), np.inf, complex)
-        start, pending, turned = 0, np.ones(len(points), bool), np.ones(len(points), complex)
+        nearest = np.full(len(points), -1)
+        offset = np.full(len(points), np.inf, complex)
+        start = 0
+        pending = np.ones(len(points), bool)
+        turned = np.ones(len(points), complex)
         for odometry, stamps in drives:
             used = images[(images >= start) & (images < start + len(stamps))] - start
             covered = pending & odometry.trajectory.covers(points.stamps_ns)
@@ -117,7 +120,8 @@ class MeasuredPoints:
         used = self.settled.used
         if not used.any():
             return start
-        weights, points = 1.0 / self.points.std[used] ** 2, self.points.places[used]
+        weights = 1.0 / self.points.std[used] ** 2
+        points = self.points.places[used]
         turn, shift = align_complex(places[used], points, weights)
         if not self.settled.turned:
             turn = complex(np.exp(1j * start.yaw_rad))
@@ -137,9 +141,11 @@ class MeasuredPoints:
 
     def warnings(self, places: Complex) -> Iterator[str]:
         """What is wrong with the points, for a map that puts the robot at places (K,)."""
-        settled, count = self.settled, int(self.settled.used.sum())
+        settled = self.settled
+        count = int(self.settled.used.sum())
         for point, placed in zip(self.quality(places)['points'], self.placed, strict=True):
-            name, miss = point['name'], point['miss_m']
+            name = point['name']
+            miss = point['miss_m']
             if not placed:
                 yield f'{name}: no image within {NEAR_M} m was used: left out'
             elif not point['used']:
@@ -171,7 +177,8 @@ def settle(measured: MeasuredPoints, places: Complex, covariance: Complex) -> Se
             f'none of {len(placed)} measured points is within {NEAR_M} m of an image that was '
             'used: are their stamps those of the bags?'
         )
-    points, std = measured.points.places[placed], measured.points.std[placed]
+    points = measured.points.places[placed]
+    std = measured.points.std[placed]
     points = points - points.mean()  # some coordinates count from the equator
     by_drive = covariance[np.ix_(placed, placed)]
     fit = _Similarity(points, places[placed], by_drive + np.diag(std**2))
@@ -185,7 +192,8 @@ def settle(measured: MeasuredPoints, places: Complex, covariance: Complex) -> Se
             f'the measured points contradict the wheels by more than a factor of {LARGEST_SCALE}: '
             'are they in meters, and each at its time?'
         )
-    settled, growth = fit.settled(inliers), 1.0
+    settled = fit.settled(inliers)
+    growth = 1.0
     while (~settled.used).sum() > max(1, len(points) // 4) and growth < _GROWTH_MAX:
         growth *= 4.0
         fit = replace(fit, noise=growth * by_drive + np.diag(std**2))
@@ -222,7 +230,8 @@ class _Similarity:
 
     def consensus(self) -> tuple[float, Mask]:
         """The least cost of a pair of points, and its inliers (K,): outliers cost the gate."""
-        least, inliers = np.inf, np.ones(len(self.points), bool)
+        least = np.inf
+        inliers = np.ones(len(self.points), bool)
         for i, j in np.argwhere(np.triu(self.pairs())).tolist():
             a = (self.places[j] - self.places[i]) / (self.points[j] - self.points[i] or 1e-9)
             if not 1 / LARGEST_SCALE < abs(a) < LARGEST_SCALE:
@@ -232,7 +241,8 @@ class _Similarity:
             wheels = (np.log(abs(a)) / WHEELS_STD) ** 2
             cost = float(np.minimum([*squares, wheels], _GATE).sum())
             if cost < least:
-                least, inliers = cost, squares < _GATE
+                least = cost
+                inliers = squares < _GATE
         return least, inliers
 
     def settled(self, used: Mask) -> Settled:

@@ -87,7 +87,9 @@ class Mount:
         """Variances (3 + D,) of [l, s, kappa] without the first drive's yaw, which is 0: of a
         camera above base_link, or at the measured place, and of a camera anywhere on the robot."""
         later = [CAMERA_TURN_STD**2] * (len(self.yaw) - 1)
-        placed, anywhere, slip = GIVEN_STD_M**2, CAMERA_STD_M**2, SLIP_STD_M**2
+        placed = GIVEN_STD_M**2
+        anywhere = CAMERA_STD_M**2
+        slip = SLIP_STD_M**2
         above = [placed, placed, slip, slip, *later]
         return np.array(above), np.array([anywhere, anywhere, placed, placed, *later])
 
@@ -103,7 +105,8 @@ class Mount:
 
     def stepped(self, information: Array, gradient: Array) -> Mount:
         """One step on, by S (4 + D, 4 + D) and B^T r (4 + D,) at the mount of the segments."""
-        mount, center = self.of(len(gradient) - 4), self.given or 0j
+        mount = self.of(len(gradient) - 4)
+        center = self.given or 0j
         moved = self.lever - center
         # Of all but the yaw in the first drive, which is 0.
         free = np.delete(np.arange(len(gradient)), 4)
@@ -114,7 +117,9 @@ class Mount:
             tracked, std = self.tracked
             information[[0, 1], [0, 1]] += 1 / std**2
             pull[:2] += (tracked - center).real / std**2, (tracked - center).imag / std**2
-        means, spreads, evidence = [], [], []
+        means = []
+        spreads = []
+        evidence = []
         for prior in mount._priors():
             spread = np.linalg.inv(information + np.diag(1 / prior))
             mean = spread @ pull
@@ -141,7 +146,8 @@ class Mount:
         """Logarithm of the likelihood of the changes of images in turns, for a lever."""
         if self.turning is None:
             return 0.0
-        square, (measured, std) = abs(lever) ** 2, self.turning
+        square = abs(lever) ** 2
+        (measured, std) = self.turning
         variance = std**2 + LEVEL_M2**2 + (UNSURE * square) ** 2
         return -(((square - measured) ** 2) / variance + math.log(variance)) / 2
 
@@ -150,7 +156,8 @@ class Mount:
         """The sentence that says how images contradict a measured lever arm, or ''."""
         if self.given is None or self.learned is None:
             return ''
-        (lever, std), given = self.learned, self.given
+        (lever, std) = self.learned
+        given = self.given
         if abs(lever - given) < CONTRADICTS * math.hypot(std, GIVEN_STD_M):
             return ''
         return (

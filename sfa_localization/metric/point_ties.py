@@ -29,7 +29,8 @@ def ties(
     The heading of the points turns with the mean of the segments from that at the poses
     `before`, without which there are no rows.
     """
-    n, used = stack.segments, measured.settled.used & measured.settled.turned
+    n = stack.segments
+    used = measured.settled.used & measured.settled.turned
     if before is None or not used.any():
         return sparse.csr_array((0, 3 * n), dtype=complex)
     placed = rows(measured, stack)[used]

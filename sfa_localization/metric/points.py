@@ -28,7 +28,8 @@ _USAGE = 'lines are "stamp_s, x_m, y_m" or "stop, number, x_m, y_m", then perhap
 
 def stops(odometry: Odometry) -> Stamps:
     """First and last stamp (S, 2) of each time the robot stood for STOP_S or longer."""
-    stamps, track = odometry.stamps_ns, odometry.trajectory
+    stamps = odometry.stamps_ns
+    track = odometry.trajectory
     later = stamps + round(STOP_S * 1e9)
     if len(stamps) < 2:
         return np.zeros((0, 2), np.int64)
@@ -86,7 +87,11 @@ def _lines(path: Path) -> Iterator[tuple[int, int | None, int, complex, float]]:
             stamp_ns = 0 if stop is not None else int(Decimal(cells[0]) * 10**9)
             x, y, std = map(float, [*cells[1:], str(POINT_STD_M)][:3])
         except (ArithmeticError, ValueError, IndexError):
-            stop, stamp_ns, x, y, std = None, 0, math.nan, math.nan, math.nan
+            stop = None
+            stamp_ns = 0
+            x = math.nan
+            y = math.nan
+            std = math.nan
         if not (math.isfinite(x + y) and 0 < std < math.inf and len(cells) <= 4):
             raise DataError(f'{path}: line {number}: {line.strip()!r} is no point: {_USAGE}')
         yield number, stop, stamp_ns, complex(x, y), std

@@ -41,9 +41,12 @@ SAMPLED = 500
 _ROUNDS = 3
 # Weak priors of origins (1 / m^2) and directions (1 / rad^2), for drives without links to the
 # others.
-_ORIGIN_PRIOR, _DIRECTION_PRIOR = 1e-8, 1e-3
+_ORIGIN_PRIOR = 1e-8
+_DIRECTION_PRIOR = 1e-3
 # Newton's steps, halvings of a step, and the decrease of the cost that ends them.
-_STEPS, _HALVINGS, _CONVERGED = 100, 20, 1e-8
+_STEPS = 100
+_HALVINGS = 20
+_CONVERGED = 1e-8
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +76,11 @@ class Graph:
     @classmethod
     def of(cls, segments: Segments) -> Graph:
         """By odometry, offsets and measured points, each weighted by how well it fits."""
-        stack, stated = Stack.of(segments), Links.of(segments)
-        loops, links, graph = Loops.of(segments.offsets, stack), stated, None
+        stack = Stack.of(segments)
+        stated = Links.of(segments)
+        loops = Loops.of(segments.offsets, stack)
+        links = stated
+        graph = None
         for _ in range(_ROUNDS):
             links = graph.learned(stated, links) if graph else stated
             before = graph.poses if graph else None
@@ -90,7 +96,8 @@ class Graph:
             normal = _gauss_newton(form, graph.poses, stack.period)
             graph = replace(graph, factor=_factor(normal))
         assert graph is not None
-        poses, period = graph.poses, stack.period
+        poses = graph.poses
+        period = stack.period
         by_loops = loops.by_mount(stack, before, poses)
         by_mount = np.vstack([links.by_mount(stack, poses), by_loops])
         by_both = np.real((rows @ derivative(poses, period)).conj().T @ by_mount)
@@ -131,7 +138,8 @@ class Graph:
     @property
     def angle_covariance(self) -> Array:
         """(N, N) rad^2 of the directions, relative to the rotation of all together."""
-        n, size = self.stack.segments, self.factor.shape[0]
+        n = self.stack.segments
+        size = self.factor.shape[0]
         angles = self.covariance_times(np.eye(size, n, -2 * n))[2 * n : 3 * n]
         centered = angles - angles.mean(0)
         return np.asarray(centered - centered.mean(1)[:, None])
@@ -156,7 +164,8 @@ class Graph:
         """Derivative (K, P) of places, rows (K, 3N) times y, without that of a motion of the whole
         map."""
         by_y = derivative(self.poses, self.stack.period)
-        by, by_images = rows @ by_y, self._image_rows @ by_y
+        by = rows @ by_y
+        by_images = self._image_rows @ by_y
         places = self.poses.places(self.stack)
         arms = places - places.mean()
         turn = np.real(-1j * (arms.conj() @ by_images)) / np.sum(np.abs(arms) ** 2)
@@ -192,7 +201,8 @@ class Graph:
 def graph_poses(graph: Graph, count: int) -> Array:
     """Poses (count, 3) of the camera, x m, y m, yaw rad, at the images, in a frame of their own;
     NaN for those of no segment."""
-    stack, places = graph.stack, graph.poses.places(graph.stack)
+    stack = graph.stack
+    places = graph.poses.places(graph.stack)
     poses = np.full((count, 3), np.nan)
     poses[stack.images] = np.column_stack([places.real, places.imag, stack.yaws(graph.poses)])
     return poses
@@ -213,7 +223,9 @@ def cost(form: Any, poses: SegmentPoses, stack: Stack) -> float:
 
 def refined(form: Any, stack: Stack, start: SegmentPoses) -> SegmentPoses:
     """The minimum near a start, by Newton's steps, halved until they descend."""
-    poses, n, least = start, stack.segments, cost(form, start, stack)
+    poses = start
+    n = stack.segments
+    least = cost(form, start, stack)
     for _ in range(_STEPS):
         factor, gradient = _normal(form, poses, stack.period)
         step = factor.solve(-gradient)
@@ -231,7 +243,8 @@ def refined(form: Any, stack: Stack, start: SegmentPoses) -> SegmentPoses:
                 break
         else:
             break
-        poses, least = tried, new
+        poses = tried
+        least = new
         if -gradient @ step < _CONVERGED:
             break
     return poses
@@ -240,7 +253,8 @@ def refined(form: Any, stack: Stack, start: SegmentPoses) -> SegmentPoses:
 def derivative(poses: SegmentPoses, period: Indices) -> Any:
     """Of y = [o, z, -b z] by [Re o, Im o, angles of z, b]: (3N, P)."""
     n = len(period)
-    origins, turned = sparse.eye_array(n), sparse.diags_array(1j * poses.z)
+    origins = sparse.eye_array(n)
+    turned = sparse.diags_array(1j * poses.z)
     by_bias = sparse.csr_array((-poses.z, (np.arange(n), period)), (n, len(poses.bias)))
     drifted = sparse.diags_array(-1j * poses.bias[period] * poses.z)
     return sparse.block_array(
@@ -257,7 +271,8 @@ def _gauss_newton(
 ) -> Any:
     """The normal equations (P, P). A rotation of all segments costs nothing: the first direction
     is held."""
-    n, by = len(period), derivative(poses, period)
+    n = len(period)
+    by = derivative(poses, period)
     prior = np.repeat([0.0, _DIRECTION_PRIOR, bias_std**-2], [2 * n, n, len(poses.bias)])
     prior[2 * n] = 1.0
     return (by.conj().T @ form @ by).real + sparse.diags_array(prior)
@@ -268,13 +283,15 @@ def _normal(
 ) -> tuple[SuperLU, Array]:
     """The factor of half the Hessian of the cost, or of Gauss and Newton's where that is not
     positive, and half the gradient (P,)."""
-    n, y = len(period), poses.coefficients(period)
+    n = len(period)
+    y = poses.coefficients(period)
     pull = form @ y
     gradient = np.real(derivative(poses, period).conj().T @ pull)
     gradient[3 * n :] += poses.bias / YAW_BIAS_STD**2
     curvature = -np.real(y[n:].conj() * pull[n:]).reshape(2, n).sum(0)
     mixed = np.real(1j * poses.z.conj() * pull[2 * n :])
-    angles, biases = 2 * n + np.arange(n), 3 * n + period
+    angles = 2 * n + np.arange(n)
+    biases = 3 * n + period
     at = np.concatenate([angles, angles, biases]), np.concatenate([angles, biases, angles])
     gauss_newton = _gauss_newton(form, poses, period, bias_std)
     values = np.concatenate([curvature, mixed, mixed])
@@ -308,7 +325,8 @@ def _real(hermitian: Any) -> Any:
 
 def proof(form: Any, poses: SegmentPoses, period: Indices) -> Certificate:
     """The certificate of poses at a minimum of a form (3N, 3N)."""
-    n, at_biases = len(period), _at_biases(form, poses.bias, period)
+    n = len(period)
+    at_biases = _at_biases(form, poses.bias, period)
     pull = (at_biases @ np.concatenate([poses.o, poses.z]))[n:]
     multipliers = np.append(np.zeros(n), np.real(poses.z.conj() * pull))
     entries = np.real(at_biases.diagonal())

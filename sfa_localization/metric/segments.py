@@ -30,15 +30,18 @@ PIECE_LENGTH_M = 3.0
 """Longest piece of any drive: long enough for several images, short enough to be rigid."""
 PIECE_STD_M = 0.1
 """Largest odometry error inside a piece: about the error of one image."""
-LINE_LENGTH_MIN_M, LINE_BEND_MAX_RAD = 2.0, np.deg2rad(8.0)
+LINE_LENGTH_MIN_M = 2.0
+LINE_BEND_MAX_RAD = np.deg2rad(8.0)
 """Straight lines are longer than the first, and end where the heading changes by the second."""
-SPEED_MIN_MPS, TURN_RATE_MAX_RADPS = 0.01, 0.2
+SPEED_MIN_MPS = 0.01
+TURN_RATE_MAX_RADPS = 0.2
 """A slower robot stands, and one that turns faster does not drive a straight line."""
 IMAGES_MIN = 3
 """Fewest images of a segment: two determine its origin and direction, the third tests them."""
 IMAGE_STEP_MAX_M = 1.5
 """Longest distance without an image inside a segment."""
-IMAGE_STEP_MIN_M, IMAGE_TURN_MIN_RAD = 0.01, np.deg2rad(3.0)
+IMAGE_STEP_MIN_M = 0.01
+IMAGE_TURN_MIN_RAD = np.deg2rad(3.0)
 """An image repeats the one before if the robot moved and turned by less between them."""
 BIAS_PERIOD_S = 60.0
 """The yaw-rate bias of odometry is constant for about this long: floors and tires change it."""
@@ -140,7 +143,8 @@ def cut_track(track: OdometryTrack, image_stamps_ns: Stamps, config: SegmentConf
 
     Raises DataError if no segment remains.
     """
-    skipped, straight = Counter[str](), config.segments == 'straight'
+    skipped = Counter[str]()
+    straight = config.segments == 'straight'
     poses = ImagePoses.on(track, np.asarray(image_stamps_ns, np.int64), skipped)
     poses = _without_standstill(poses, skipped)
     candidates = _lines(poses, track, skipped) if straight else _pieces(poses)
@@ -184,7 +188,8 @@ def join(parts: Sequence[Segments], offsets: Sequence[int]) -> Segments:
 
 
 def _sum(counts: Iterable[Count]) -> Count:
-    used, skipped = 0, Counter[str]()
+    used = 0
+    skipped = Counter[str]()
     for count in counts:
         used += count.used
         skipped.update(count.skipped)
@@ -229,7 +234,8 @@ class ImagePoses:
         skipped['in a break of odometry'] += int((inside & ~unbroken).sum())
         images = np.flatnonzero(inside & unbroken)
         x, y, yaw = Trajectory(track.stamps_ns, track.poses).at(stamps[images]).T
-        time_s, seconds = (stamps[images] - track.stamps_ns[0]) * 1e-9, track.seconds
+        time_s = (stamps[images] - track.stamps_ns[0]) * 1e-9
+        seconds = track.seconds
         moment = summed(np.diff(track.place) * (seconds[1:] + seconds[:-1]) / 2)
         return cls(
             images=images,
@@ -282,7 +288,8 @@ def _without_standstill(poses: ImagePoses, skipped: Counter[str]) -> ImagePoses:
 
 def _lines(poses: ImagePoses, track: OdometryTrack, skipped: Counter[str]) -> list[Indices]:
     """Straight lines: driven, not turning, between turns on the spot."""
-    half, seconds = _SMOOTHING_S / 2, track.seconds
+    half = _SMOOTHING_S / 2
+    seconds = track.seconds
     window = np.clip([poses.time_s - half, poses.time_s + half], 0.0, seconds[-1])
     time_s = np.maximum(np.diff(window, axis=0)[0], 1e-9)
     speed, turn_rate = (
@@ -334,7 +341,9 @@ def _wear(poses: ImagePoses, group: Indices) -> Array:
 
 def _segment(poses: ImagePoses, group: Indices, straight: bool) -> Segment:
     """One segment in its own frame."""
-    place, time, yaw = poses.place[group], poses.time_s[group], poses.yaw[group]
+    place = poses.place[group]
+    time = poses.time_s[group]
+    yaw = poses.yaw[group]
     heading, time_s = (yaw.mean(), time.mean()) if straight else (yaw[0], time[0])
     path = (place - place[0]) * np.exp(-1j * heading)
     drift = poses.drift(int(group[0]), group, heading, time_s)
@@ -344,7 +353,8 @@ def _segment(poses: ImagePoses, group: Indices, straight: bool) -> Segment:
         path = summed(np.abs(step) * np.where(step.real < 0, -1.0, 1.0)).astype(complex)
         drift = np.zeros(len(group), complex)
     start = np.array([place[0].real, place[0].imag, heading])
-    images, since_start_s = poses.images[group], float(time[0])
+    images = poses.images[group]
+    since_start_s = float(time[0])
     return Segment(
         images, path, yaw - heading, time - time_s, drift, start, since_start_s=since_start_s
     )
@@ -357,7 +367,8 @@ def _linked(poses: ImagePoses, a: Segment, b: Segment, first: int, last: int) ->
     """
     if poses.part[first] != poses.part[last]:
         return a
-    time_a, time_b = poses.time_s[first] - a.times_s[0], poses.time_s[last] - b.times_s[0]
+    time_a = poses.time_s[first] - a.times_s[0]
+    time_b = poses.time_s[last] - b.times_s[0]
     drift = poses.drift(first, np.array([last]), float(a.start[2]), float(time_a))
     moved = poses.place[last] - poses.place[first]
     return replace(

@@ -59,7 +59,8 @@ class Stack:
 
     @classmethod
     def of(cls, segments: Segments) -> Stack:
-        sizes, run = [len(s.images) for s in segments], np.array([s.run for s in segments])
+        sizes = [len(s.images) for s in segments]
+        run = np.array([s.run for s in segments])
         return cls(
             np.concatenate([s.images for s in segments]),
             np.repeat(np.arange(len(sizes)), sizes),
@@ -109,14 +110,18 @@ class Stack:
     def place_rows(self, rows: Indices, shares: Array) -> Any:
         """Rows (L, 3N) whose products with [o, z, -b z] are sums, by `shares`, of the places of
         images in `rows` (L,) or (L, K) of the stack."""
-        n, owner = self.segments, self.owner[rows]
-        places, drift = shares * self.path[rows], shares * self.drift[rows]
+        n = self.segments
+        owner = self.owner[rows]
+        places = shares * self.path[rows]
+        drift = shares * self.drift[rows]
         return self.sparse((owner, shares), (n + owner, places), (2 * n + owner, drift))
 
     def facing_rows(self, rows: Indices, shares: Array | Complex) -> Any:
         """The same (L, 3N) of the directions exp(i yaw) that the images face; complex shares turn
         them."""
-        n, owner, facing = self.segments, self.owner[rows], np.exp(1j * self.headings[rows])
+        n = self.segments
+        owner = self.owner[rows]
+        facing = np.exp(1j * self.headings[rows])
         drift = 1j * self.times_s[rows] * facing
         return self.sparse((n + owner, shares * facing), (2 * n + owner, shares * drift))
 
@@ -151,7 +156,8 @@ def tracks(segments: Segments) -> Indices:
 
     A held-out part represents unseen places, so all segments along one track are held out together.
     """
-    track, pairs = np.arange(len(segments)), segments.closures.images
+    track = np.arange(len(segments))
+    pairs = segments.closures.images
     if not len(pairs):
         return track
     count = max(int(pairs.max()), max(int(s.images.max()) for s in segments)) + 1

@@ -27,12 +27,14 @@ StampedTextures = tuple[Stamps, NDArray[np.int8]]
 robot."""
 STEP = 0.2
 """m or rad, by odometry, between two images that are compared."""
-STILL, STRAIGHT = 1 / 20, 0.25
+STILL = 1 / 20
+STRAIGHT = 0.25
 """Images stand still if they change by less than this share of the usual change for the distance
 driven: those of a standing robot by 1/500, of a driving one by 1/7 or more (two gardens, four real
 logs). The usual change is the lower quartile over distances driven straight, because images change
 more in turns."""
-STANDING, STOOD_S = 0.01, 1.0
+STANDING = 0.01
+STOOD_S = 1.0
 """Slower wheels, m/s or rad/s, stand; a robot that stands so long may be carried."""
 OTHER = 0.05
 """Quantile of the correlations of neighboring images below which an image may show another
@@ -47,22 +49,26 @@ def _jumps(odometry: Odometry) -> tuple[Mask, Array, float]:
     """Mask (N - 1,) of impossible steps, the steps (N - 1, 3) interpolated from the motion around
     them, and the standard deviation, m, of the regular steps from these.
     """
-    step, dt = relative(odometry.poses[:-1], odometry.poses[1:]), np.diff(odometry.stamps_ns) * 1e-9
+    step = relative(odometry.poses[:-1], odometry.poses[1:])
+    dt = np.diff(odometry.stamps_ns) * 1e-9
     period = max(float(np.median(dt)), 1e-3)
     at = summed(dt)[:-1] + dt / 2
     reach = max(_AROUND_S, 3 * period)
     here = np.arange(len(step))
-    first, last = np.searchsorted(at, at - reach), np.searchsorted(at, at + reach, 'right')
+    first = np.searchsorted(at, at - reach)
+    last = np.searchsorted(at, at + reach, 'right')
     # Messages may be stamped late, or in bundles: a step took between `shortest_s` and `more_s`
     # longer than that.
     unsure_s = float(np.percentile(np.abs(dt - period), 90))
     shortest_s = np.maximum(dt - unsure_s, 0.0)
     more_s = np.maximum(dt, period) + unsure_s - shortest_s
     single = np.pad(step / np.maximum(dt, period)[:, None], ((1, 1), (0, 0)), 'edge')
-    values, jump = np.column_stack([step, dt]), np.zeros(len(step), bool)
+    values = np.column_stack([step, dt])
+    jump = np.zeros(len(step), bool)
     for _ in range(2):
         sums = np.vstack([np.zeros(4), np.cumsum(values * ~jump[:, None], axis=0)])
-        before, after = sums[here] - sums[first], sums[last] - sums[here + 1]
+        before = sums[here] - sums[first]
+        after = sums[last] - sums[here + 1]
         means = [each[:, :3] / np.maximum(each[:, 3:], period) for each in (before, after)]
         usual = (before + after)[:, :3] / np.maximum((before + after)[:, 3:], period) * dt[:, None]
         noise = MEDIAN_TO_STD * float(np.median(np.abs(step - usual)[:, :2].max(1)))
@@ -99,7 +105,8 @@ def parted(odometry: Odometry) -> tuple[Odometry, str]:
     far = float(np.hypot(*(step - usual)[jump, :2].T).max())
     step = np.where(jump[:, None], usual, step)
     poses = chained(odometry.poses[0], step)
-    count, joined = int(jump.sum()), int((jump & ~cut).sum())
+    count = int(jump.sum())
+    joined = int((jump & ~cut).sum())
     times = 'once' if count == 1 else f'{count} times'
     how = ['joined by its motion around'] * (joined > 0) + ['cut there'] * (joined < count)
     text = f'odometry pose jumps {times}, by up to {far:.2f} m: {" or ".join(how)}'
@@ -128,8 +135,10 @@ def contradicted(
     """Odometry that breaks where images, `textures` at their stamps, contradict the wheels, and
     sentences on that.
     """
-    stamps, step = odometry.stamps_ns, relative(odometry.poses[:-1], odometry.poses[1:])
-    seconds, length = (stamps - stamps[0]) * 1e-9, np.hypot(step[:, 0], step[:, 1])
+    stamps = odometry.stamps_ns
+    step = relative(odometry.poses[:-1], odometry.poses[1:])
+    seconds = (stamps - stamps[0]) * 1e-9
+    length = np.hypot(step[:, 0], step[:, 1])
     moved = length + np.abs(step[:, 2])
     still_s = np.where(moved < STANDING * np.diff(seconds), np.diff(seconds), 0.0)
     inside = (stamps_ns >= stamps[0]) & (stamps_ns <= stamps[-1])
@@ -137,13 +146,15 @@ def contradicted(
     rows = spaced(np.interp(images_s, seconds, summed(moved)), STEP)
     if len(rows) < 3:
         return odometry, []
-    at, small = images_s[rows], textures[inside][rows]
+    at = images_s[rows]
+    small = textures[inside][rows]
     moved, length, still_s = (
         np.diff(np.interp(at, seconds, summed(sums))) for sums in (moved, length, still_s)
     )
     likeness, turned_likeness = _likeness(small)
     # Only ways ahead show what is usual: wheels may report turns of a robot that does not turn.
-    change, ahead = -np.log(likeness), length > moved / 2
+    change = -np.log(likeness)
+    ahead = length > moved / 2
     usual = quantile(change[ahead] / length[ahead], STRAIGHT) if ahead.any() else 0.0
     stands = change < STILL * usual * length
     other = turned_likeness < min(LIKE, float(np.quantile(turned_likeness, OTHER)))

@@ -47,14 +47,17 @@ WHOLE_BY_GYRO = 1.03
 are 1.04."""
 FASTEST_MPS = 30.0
 """A faster robot publishes other units than meters."""
-SIDEWAYS, SLIGHT_TURN = 0.25, 1.0
+SIDEWAYS = 0.25
+SLIGHT_TURN = 1.0
 """Largest sideways share of the motion below the second value, rad/s, even for a base frame off the
 axle; twice as much is a wrong heading, not slip."""
-ASKEW, UNEVEN = np.deg2rad(1.0), np.deg2rad(10.0)
+ASKEW = np.deg2rad(1.0)
+UNEVEN = np.deg2rad(10.0)
 """A heading that deviates by more than this from the direction of motion (a gyroscope mounted
 askew) is corrected if its scatter is below the second value; slipping wheels scatter more."""
 # Fewer stamps, in all and in each second, do not show their unit.
-_STAMPS_MIN, _STAMPS_MIN_PER_S = 20, 3
+_STAMPS_MIN = 20
+_STAMPS_MIN_PER_S = 3
 _UNITS = ((1, 'nothing'), (1_000, 'milliseconds'), (1_000_000, 'microseconds'))
 _IMAGES_REMEDIES = {
     'alike': 'switch direction lock and stabilization off, and record one omnidirectional camera',
@@ -184,7 +187,8 @@ def _judge_width(check: MotionCheck) -> None:
 def _impossible(sources: Sequence[Source]) -> Iterator[str]:
     """Stamps in other units, and speeds that no robot reaches in a tenth of its seconds."""
     for source in sources:
-        problem, at = _stamp_problem(source.stamps_ns), _seconds(source.stamps_ns)
+        problem = _stamp_problem(source.stamps_ns)
+        at = _seconds(source.stamps_ns)
         if problem and source.name != TWIST:
             yield f'{source.name}: {problem}'
         elif not problem and 'way' in source.sums and len(at) > 1:
@@ -241,7 +245,8 @@ def _straightened(odometry: Odometry) -> tuple[Odometry, str]:
 def _judge_axes(check: MotionCheck) -> None:
     """Whether poses move along their heading, as wheels do."""
     way = _ahead(check.odometry)
-    ahead, sideways = np.abs(way.real).sum(), np.abs(way.imag).sum()
+    ahead = np.abs(way.real).sum()
+    sideways = np.abs(way.imag).sum()
     if sideways > max(ENOUGH['way'], SIDEWAYS * ahead):
         text = f'{POSE} drives {sideways:.3g} m sideways and {ahead:.3g} m ahead: correct its '
         text += 'heading and axes (x ahead, y to the left, yaw counterclockwise)'
@@ -333,7 +338,8 @@ def _report(check: MotionCheck, kind: str, group: set[str], others: set[str], pa
         images_err = factor > 1 or _devices(others) > 1
         wrong = {'alike': pair.independent, 'sign': True, 'scale': images_err}[kind]
     elif pair.what == 'way':
-        remedy, wrong = _WAY_REMEDIES[kind], drastic
+        remedy = _WAY_REMEDIES[kind]
+        wrong = drastic
     elif group >= {POSE, TWIST}:
         remedy = 'swap left and right wheel' if kind == 'sign' else 'do the wheels skid?'
         wrong = drastic
@@ -353,7 +359,9 @@ def _correct_gyro(check: MotionCheck, kind: str, text: str, factor: float) -> No
     """Mirror, convert or leave out the gyroscope."""
     if check.gyro is None:
         return
-    omega, variance, degree = check.gyro.omega, check.gyro.variance, np.pi / 180
+    omega = check.gyro.omega
+    variance = check.gyro.variance
+    degree = np.pi / 180
     if kind == 'sign':
         check.corrected.append(f'{text}: taken as upside down')
         check.gyro = replace(check.gyro, omega=-omega)

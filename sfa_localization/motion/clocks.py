@@ -33,14 +33,18 @@ from sfa_localization.motion.sources import (
 EXPLAINED = 0.5
 """A camera follows the robot if a model of this leaves at most this share of the variance that the
 best delay leaves: 0.02 to 0.5 for lags of 0.3 s and more, at least 0.9 for right drives."""
-PART_RAD, CHANCE = 2.5, 1e-4
+PART_RAD = 2.5
+CHANCE = 1e-4
 """Turn of a part of the drive, whose delay is fitted on its own (in smaller ones, images at 3 Hz
 show it within 0.1 s only), and the probability of a line by chance: none of 320 right drives has
 such a line that matters."""
 RATE_MAX = 0.02
 """Clocks of cameras are up to 1 % fast."""
 # In fewer windows any delay fits; more parts take long.
-_WINDOWS_MIN, _PARTS_MIN, _PARTS_MAX, _ROUNDS = 4, 4, 100, 4
+_WINDOWS_MIN = 4
+_PARTS_MIN = 4
+_PARTS_MAX = 100
+_ROUNDS = 4
 _STEP_S = 0.05
 _EXACT_S = 1e-3
 # Models of a camera that follows: lag, s, largest rate, rad/s, and turn that it ignores, rad.
@@ -78,7 +82,8 @@ def drift(a: Source, b: Source) -> Drift | None:
     if chosen is None:
         return None
     slow, fast, windows_ns = chosen
-    turns, seconds = slow.moved(windows_ns, 'turns'), (windows_ns[:, 0] - windows_ns[0, 0]) * 1e-9
+    turns = slow.moved(windows_ns, 'turns')
+    seconds = (windows_ns[:, 0] - windows_ns[0, 0]) * 1e-9
     if not np.abs(turns).sum() >= _PARTS_MIN * PART_RAD:  # also turns that are unknown
         return None
     first = _parts(turns)
@@ -95,7 +100,8 @@ def drift(a: Source, b: Source) -> Drift | None:
         if near.sum() < _PARTS_MIN:
             return None
         line = linregress(at_s[near], (delay_s + rate * at_s + more_s)[near])
-        rate, delay_s = float(line.slope), float(line.intercept)
+        rate = float(line.slope)
+        delay_s = float(line.intercept)
     if line.pvalue > CHANCE or not LATE_S / seconds[-1] < abs(rate) < RATE_MAX:
         return None
     at_ns = int(windows_ns[0, 0])
@@ -124,7 +130,8 @@ def _delays(turns: Array, other: Source, windows_ns: Stamps, first: Indices) -> 
         np.add.reduceat(x, first, axis=-1) for x in (moved * turns, moved**2, turns**2)
     )
     correlation = np.abs(product) / np.sqrt(power * own_power + 1e-12)
-    rows, best = np.arange(len(first)), correlation.argmax(0).clip(1, len(GRID) - 2)
+    rows = np.arange(len(first))
+    best = correlation.argmax(0).clip(1, len(GRID) - 2)
     peak = parabola_peak(*(correlation[best + by, rows] for by in (-1, 0, 1)))
     return GRID[best] + peak * (GRID[1] - GRID[0]), correlation[best, rows] > ALIKE
 
@@ -175,7 +182,8 @@ def following(sources: Sequence[Source]) -> str:
         pairs = [compare(shown, images) for shown in _followers(source, models)]
         explained = np.array([pair.correlation**2 if pair else 0.0 for pair in pairs])
         best = int(explained.argmax())
-        models, pair = models[best : best + 1], pairs[best]
+        models = models[best : best + 1]
+        pair = pairs[best]
         # Wheels with bursts of slip look smoothed before and after; no camera turns in advance.
         early = others[-1].name != GYRO and pair and (pair.delay_s or 0.0) < -LATE_S
         if early or not 1 - explained[best] < EXPLAINED * (1 - direct.correlation**2):

@@ -73,13 +73,15 @@ class OdometryTrack:
         cls, odometry: Odometry, config: SegmentConfig, yaw_rate: YawRate | None = None
     ) -> OdometryTrack:
         """From wheel odometry, with the turns of the gyroscope if there is one."""
-        stamps, skipped = odometry.stamps_ns, Counter[str]()
+        stamps = odometry.stamps_ns
+        skipped = Counter[str]()
         if len(stamps) < 2:
             raise DataError('fewer than two usable odometry messages: check the odometry topic')
         breaks = pauses(odometry)
         skipped['pauses'] += int(breaks.sum())
         breaks |= np.diff(odometry.part) != 0
-        yaw, variances = np.unwrap(odometry.poses[:, 2]), odometry.variances[:, 1]
+        yaw = np.unwrap(odometry.poses[:, 2])
+        variances = odometry.variances[:, 1]
         poses = np.column_stack([odometry.poses[:, :2], yaw])
         by_gyro = config.yaw_source != 'odometry' and bool(yaw_rate and len(yaw_rate.stamps_ns) > 1)
         if by_gyro:
@@ -142,7 +144,8 @@ class OdometryTrack:
 
     def ways(self) -> Complex:
         """Displacements (N - 1, 3) m by the steps, a loss of 1 m per radian, an offset of 1 m/s."""
-        step, turned = self.steps(), np.abs(np.diff(self.yaw))
+        step = self.steps()
+        turned = np.abs(np.diff(self.yaw))
         length = np.abs(step)
         moves = length > SPOT_RADIUS_M * turned
         ahead = np.divide(step, length, out=np.zeros_like(step), where=moves)
@@ -185,7 +188,8 @@ def bridged(odometry: Odometry) -> Array:
     """Variances (N - 1, 2) of the way, m^2, and of the turn, rad^2, in the pauses that are bridged:
     0 where the twists before and after are equal, as of drivers that publish changes of commands.
     """
-    twists, poses = odometry.twists, odometry.poses
+    twists = odometry.twists
+    poses = odometry.poses
     twists = twists if twists.any() else differences(odometry.stamps_ns, poses)
     dt = np.diff(odometry.stamps_ns) * 1e-9
     change = np.diff(twists, axis=0)
@@ -206,11 +210,14 @@ def _gyro_turns(
     They are the gyroscope's where it has readings all along a step. Elsewhere they are the
     odometry's plus the gyroscope's mean offset, so that one bias remains for the whole drive.
     """
-    stamps, variances = odometry.stamps_ns, odometry.variances[:, 1]
-    seconds, at = (gyro.stamps_ns - stamps[0]) * 1e-9, (stamps - stamps[0]) * 1e-9
+    stamps = odometry.stamps_ns
+    variances = odometry.variances[:, 1]
+    seconds = (gyro.stamps_ns - stamps[0]) * 1e-9
+    at = (stamps - stamps[0]) * 1e-9
     areas = (gyro.omega[1:] + gyro.omega[:-1]) / 2 * np.diff(seconds)
     turns = np.diff(np.interp(at, seconds, summed(areas)))
-    wheels, dt = wrap_angle(np.diff(odometry.poses[:, 2])), np.diff(at)
+    wheels = wrap_angle(np.diff(odometry.poses[:, 2]))
+    dt = np.diff(at)
     measured = without_pause(stamps[:-1], stamps[1:], gyro.stamps_ns, GAP_MAX_S)
     both = measured & unbroken
     if not both.any():

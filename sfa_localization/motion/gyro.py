@@ -77,7 +77,8 @@ def _guilty(stamps_ns: Stamps, beyond: Array, at: Stamps, turned: Array, error: 
     window = np.searchsorted(at, stamps_ns, 'right')  # 0 and M are before and after all images
     wrong = np.bincount(window, beyond * np.gradient(stamps_ns * 1e-9), len(at) + 1)
     usual = quantile(np.abs(error), 0.5, np.maximum(np.abs(turned), 1e-9))
-    variance, error = max((MEDIAN_TO_STD * usual) ** 2, 1e-12), np.pad(error, 1)
+    variance = max((MEDIAN_TO_STD * usual) ** 2, 1e-12)
+    error = np.pad(error, 1)
     ratio = surprise((error - wrong) ** 2 / variance, 1) - surprise(error**2 / variance, 1)
     ratio[[0, -1]] = 0.0
     run, number = ndimage.label(beyond)
@@ -144,6 +145,7 @@ def _is_worse(rates: Source, wheels: Source, views: Source, sign: float) -> bool
     whole = without_pause(at[:-1], at[1:], rates.stamps_ns, GAP_MAX_S) & (np.diff(at) > 0)
     if not whole.any():
         return False
-    by_gyro, seconds = by_gyro[whole], np.diff(at)[whole] * 1e-9
+    by_gyro = by_gyro[whole]
+    seconds = np.diff(at)[whole] * 1e-9
     by_gyro -= np.median(by_gyro / seconds) * seconds
     return bool(np.abs(by_gyro).mean() > WORSE * np.abs(by_wheels[whole]).mean())

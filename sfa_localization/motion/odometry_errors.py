@@ -33,17 +33,20 @@ CHANCE_STDS = 4.0
 """A loss of fewer standard deviations may be chance."""
 OFFSET_STD = 0.01
 """Prior of the offset of the speed, m/s: of five robots 0.003 to 0.023."""
-LARGEST_LOSS, LARGEST_SCALE = 0.3, 1.5
+LARGEST_LOSS = 0.3
+LARGEST_SCALE = 1.5
 """m per radian, half the track of a large robot, and scale of the way: beyond them images do not
 show a loss in turns."""
 PAIRS_MIN = 50
 """Fewer pairs of images are no evidence."""
-REACH_M, UNEQUAL = (3.0, 50.0), 0.02
+REACH_M = (3.0, 50.0)
+UNEQUAL = 0.02
 """The scale of two drives is compared between places that are farther apart than the first, many
 times the error of closures, with less way between them; that of equal wheels differs by less than
 the third."""
 # Closures of two drives that are paired, and rounds of reweighting until the fit settles.
-_PAIRED, _ROUNDS = 400, 10
+_PAIRED = 400
+_ROUNDS = 10
 
 
 logger = logging.getLogger(__name__)
@@ -58,11 +61,13 @@ def way_of(
     clock of the odometry. Images of a map that was learned with the way `before` show another loss,
     but no other scale.
     """
-    seconds, time_s = track.seconds, (stamps_ns - track.stamps_ns[0]) * 1e-9
+    seconds = track.seconds
+    time_s = (stamps_ns - track.stamps_ns[0]) * 1e-9
     part = track.part[np.searchsorted(seconds, time_s, 'right') - 1]
     rows = spaced(np.interp(time_s, seconds, track.length), STEP_M)
     whole = part[rows[:-1]] == part[rows[1:]]
-    first, last = rows[:-1][whole], rows[1:][whole]
+    first = rows[:-1][whole]
+    last = rows[1:][whole]
     if len(first) < PAIRS_MIN:
         return None
     turn = np.exp(1j * (poses[:, 2] - np.interp(time_s, seconds, track.yaw)))
@@ -77,7 +82,8 @@ def way_of(
     if not 1 / LARGEST_SCALE < way.scale < LARGEST_SCALE:
         return None
     if before is not None:
-        shape, whole = ways @ way.scaled(1 / way.scale).values, ways @ before.values
+        shape = ways @ way.scaled(1 / way.scale).values
+        whole = ways @ before.values
         scale = float(np.real(np.vdot(shape, whole)) / np.real(np.vdot(shape, shape)))
         way = way.scaled(scale / way.scale)
     clear = _is_clear(way.loss) or _is_clear(way.offset)
@@ -91,9 +97,11 @@ def _is_clear(error: Quantity) -> bool:
 def _fitted(moved: Complex, ways: Complex, offset_std: float) -> Way:
     """The way by least squares of displacements (K,) by those of `OdometryTrack.ways` (K, 3), with
     smaller weights of outliers among the places of images; `offset_std` m/s is a prior."""
-    rows, values = np.vstack([ways.real, ways.imag]), np.concatenate([moved.real, moved.imag])
+    rows = np.vstack([ways.real, ways.imag])
+    values = np.concatenate([moved.real, moved.imag])
     prior = np.diag([0.0, 0.0, max(offset_std, 1e-6) ** -2])
-    weight, std = np.ones(len(values)), 1.0
+    weight = np.ones(len(values))
+    std = 1.0
     for _ in range(_ROUNDS):
         weighted = (rows * weight[:, None]).T / std**2
         covariance = np.linalg.pinv(weighted @ rows + prior)
@@ -113,7 +121,9 @@ def same_scale(runs: Sequence[Run], closures: Closures) -> tuple[Run, ...]:
     """
     starts = np.cumsum([0, *(len(run.panoramas) for run in runs)])
     owner = np.searchsorted(starts, closures.images, 'right') - 1
-    pairs, ratios, is_clear = [], [], False
+    pairs = []
+    ratios = []
+    is_clear = False
     for first, second in combinations(range(len(runs)), 2):
         images = closures.images[(owner == [first, second]).all(axis=1)] - starts[[first, second]]
         ratio, std = _log_ratio(runs[first], runs[second], images)
@@ -152,8 +162,10 @@ def _rescaled(run: Run, factor: float) -> Run:
         return run
     text = '%s: its wheels count %.3g times the way of the median drive: taken into account'
     logger.warning(text, run.name, factor)
-    odometry, scale = run.odometry, np.array([factor, factor, 1.0])
-    poses, twists = odometry.poses / scale, odometry.twists / scale[1:]
+    odometry = run.odometry
+    scale = np.array([factor, factor, 1.0])
+    poses = odometry.poses / scale
+    twists = odometry.twists / scale[1:]
     return replace(run, odometry=replace(odometry, poses=poses, twists=twists))
 
 

@@ -32,7 +32,8 @@ def fault_sentence(name: str, mask: Mask, stamps_ns: Stamps, others: str) -> str
     if not len(rows):
         return ''
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    longest, first_s = int(np.diff(edges)[::2].max()), (stamps_ns[rows[0]] - stamps_ns[0]) * 1e-9
+    longest = int(np.diff(edges)[::2].max())
+    first_s = (stamps_ns[rows[0]] - stamps_ns[0]) * 1e-9
     row = f', up to {longest} in a row' if longest > 1 else ''
     return (
         f'{name}: {len(rows)} of {len(mask)} messages contradict {others}{row}, the first after '

@@ -19,9 +19,13 @@ from sfa_localization.data.run import Odometry, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, parabola_peak, quantile
 from sfa_localization.motion.dead_reckoning import summed, without_pause
 
-IMAGES, POSE, TWIST, GYRO = 'images', 'odometry pose', 'odometry twist', 'gyroscope'
+IMAGES = 'images'
+POSE = 'odometry pose'
+TWIST = 'odometry twist'
+GYRO = 'gyroscope'
 MAP = 'map'
-ALIKE, UNLIKE = 0.7, 0.3
+ALIKE = 0.7
+UNLIKE = 0.3
 """Sources correlated by more than the first measure the same motion (half of the variance); below
 the second they are independent. Between them nothing is certain."""
 ENOUGH = {'turns': 2 * np.pi, 'way': 2.0}
@@ -32,7 +36,8 @@ as far as the robot."""
 EQUAL = 1.5
 """A ratio of two sources beyond this factor is neither sampling nor calibration; within this factor
 of a ratio of units, the units explain it."""
-WHOLE, CERTAIN = 1.15, 0.95
+WHOLE = 1.15
+CERTAIN = 0.95
 """The stricter limit for images whose correlation exceeds the second: panoramas that show a whole
 turn were within 3 %."""
 LATE_S = 0.05
@@ -43,7 +48,9 @@ FAR = 3.0
 """Steps beyond so many times the typical one are clipped, and errors beyond so many standard
 deviations take no part."""
 # Windows are lengthened until half of the motion is in windows with _STEP (rad, m) or more.
-_WINDOWS_S, _STEP, _WINDOWS_MAX = 0.19 * 2.0 ** np.arange(4), 0.1, 3000
+_WINDOWS_S = 0.19 * 2.0 ** np.arange(4)
+_STEP = 0.1
+_WINDOWS_MAX = 3000
 _PAUSE_S = 1.0
 # A delay is certain if the delays that fit nearly as well scatter by less than this, s.
 _STD_MAX_S = 0.06
@@ -82,7 +89,8 @@ def sources_of(
     `images` are their stamps (N,) and headings (N,) rad: the sums of the shifts between them.
     """
     step = relative(odometry.poses[:-1], odometry.poses[1:])
-    half, seconds = step[:, 2] / 2, np.diff(odometry.stamps_ns) * 1e-9
+    half = step[:, 2] / 2
+    seconds = np.diff(odometry.stamps_ns) * 1e-9
     ahead = step[:, 0] * np.cos(half) + step[:, 1] * np.sin(half)
     # Drivers leave at 0 what they do not measure.
     rates = zip(('way', 'turns'), (odometry.twists[1:] * seconds[:, None]).T, strict=True)
@@ -208,7 +216,8 @@ def _windows(slow: Source, fast: Source, length_s: float) -> Stamps:
     reach = round(CLOCK_RANGE_S * 1e9)
     for source, margin in ((slow, 0), (fast, reach)):
         pause_s = max(_PAUSE_S, 3 * source.period_s)
-        begin, end = windows[:, 0] - margin, windows[:, 1] + margin
+        begin = windows[:, 0] - margin
+        end = windows[:, 1] + margin
         windows = windows[without_pause(begin, end, source.stamps_ns, pause_s)]
     return windows[:: len(windows) // _WINDOWS_MAX + 1]
 
@@ -239,7 +248,8 @@ def _regressed(what: str, a: Source, b: Source, x: Array, y: Array) -> Pair | No
         # The least sum of |y - scale x|.
         ratio = y[best] / np.where(x[best] == 0, 1.0, x[best])
         scale = quantile(ratio[inlier], 0.5, np.abs(x[best, inlier]))
-        residual, moves = np.abs(y[best] - scale * x[best]), np.abs(u[best]) > limit[0] / 4
+        residual = np.abs(y[best] - scale * x[best])
+        moves = np.abs(u[best]) > limit[0] / 4
         std = MEDIAN_TO_STD * float(np.median(residual[moves])) if moves.any() else np.inf
         inlier = residual <= max(FAR * std, limit[1] / 2)
     # Delays whose correlation is within one standard deviation of the best.
@@ -272,6 +282,7 @@ def compare_map(odometry: Odometry, stamps_ns: Stamps, poses: Array) -> Pair | N
         * np.exp(-1j * path[first, 2])
         for path in (driven, poses)
     )
-    product, power = np.vdot(x, y), max(float(np.vdot(x, x).real), 1e-12)
+    product = np.vdot(x, y)
+    power = max(float(np.vdot(x, x).real), 1e-12)
     correlation = float(np.abs(product) / np.sqrt(max(power * np.vdot(y, y).real, 1e-12)))
     return Pair('way', POSE, MAP, float(product.real) / power, None, correlation)

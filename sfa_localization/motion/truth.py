@@ -32,8 +32,11 @@ from sfa_localization.motion.dead_reckoning import TURN_SLIDE, OdometryTrack
 from sfa_localization.motion.samples import OUTLIER, fault_sentence, faulty
 from sfa_localization.motion.sources import ALIKE, EQUAL, LATE_S, late
 
-TRUTH, POINTS = 'ground truth', 'points_topic'
-WINDOW_M, WINDOWS_MIN, NOISE_M = 3.0, 4, 0.01
+TRUTH = 'ground truth'
+POINTS = 'points_topic'
+WINDOW_M = 3.0
+WINDOWS_MIN = 4
+NOISE_M = 0.01
 """Length of a window, in which wheels deviate by the last value. Fewer windows show nothing."""
 UNSTEADY = 0.15
 """Mean of 1 - cos of the rotations from window to window: at most 0.09 for real robots with their
@@ -49,11 +52,15 @@ ASIDE = np.deg2rad(10.0)
 """A smaller offset of the headings may be that of either source."""
 WHEELS_STD = 0.05
 """Of the scale of a window, by the drives of the simulator."""
-_SAMPLES, _STEP_S = 4000, 0.2
+_SAMPLES = 4000
+_STEP_S = 0.2
 _PRIOR_STD = np.array([1.0, 1.0, 1.0, 0.1])
 """Of theta: lever arm ahead and to the left, m, delay, s, and logarithm of the scale."""
 _SCALE: Mask = np.array([False, False, False, True])
-_STEP, _CLOSE, _ROUNDS = 0.05, 1e-4, 12  # of theta
+# of theta
+_STEP = 0.05
+_CLOSE = 1e-4
+_ROUNDS = 12
 _UNITS = {1.0: '', 100.0: 'centimeters', 1000.0: 'millimeters'}
 
 
@@ -115,8 +122,10 @@ def _matched(
     """
     total = windows @ weight
     true, here = (path - windows.T @ (windows @ (weight * path) / total) for path in (true, here))
-    match, power = windows @ (weight * here.conj() * true), windows @ (weight * np.abs(here) ** 2)
-    size, sure = np.abs(match) + 1e-12, variance / WHEELS_STD**2
+    match = windows @ (weight * here.conj() * true)
+    power = windows @ (weight * np.abs(here) ** 2)
+    size = np.abs(match) + 1e-12
+    sure = variance / WHEELS_STD**2
     motion = match / size * (size + sure) / (power + sure)
     return true - (windows.T @ motion) * here, match, np.where(total > 1, power / total, 0.0)
 
@@ -128,7 +137,9 @@ class _Comparison:
         self, truth: Trajectory, track: OdometryTrack, usual: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> None:
         self.usual = np.array([*usual, 0.0])
-        self.track, self.track_s, self.way = track, track.seconds, track.length
+        self.track = track
+        self.track_s = track.seconds
+        self.way = track.length
         self.wheels = track.poses[:, 0] + 1j * track.poses[:, 1]
         self.seconds = (truth.stamps_ns - track.stamps_ns[0]) * 1e-9
         self.places = truth.poses[:, 0] + 1j * truth.poses[:, 1]
@@ -150,7 +161,8 @@ class _Comparison:
         for at, places in (self.track_s, self.wheels), (self.seconds, self.places):
             step = np.diff(np.interp(np.arange(at[0], at[-1], _STEP_S), at, places))
             speeds.append(np.where(np.abs(step) < 3 * np.median(np.abs(step)), step, 0))
-        by_wheels, true = speeds[0], speeds[1].conj() if mirrored else speeds[1]
+        by_wheels = speeds[0]
+        true = speeds[1].conj() if mirrored else speeds[1]
         behind = int(np.argmax(np.abs(signal.correlate(true, by_wheels)))) - len(by_wheels) + 1
         return float(self.seconds[0] - self.track_s[0]) + _STEP_S * behind
 
@@ -173,7 +185,8 @@ class _Comparison:
             here = self.marker(theta, self.seconds[rows])
             return _matched(places, here, windows, weight, each * std**2)
 
-        weight, std = used + 1e-6, NOISE_M
+        weight = used + 1e-6
+        std = NOISE_M
         for _ in range(_ROUNDS):
             residual, match, spread = matched(theta, weight, std)
             std = max(LENGTH_TO_STD * float(np.median(np.abs(residual[used]))), NOISE_M)
@@ -215,7 +228,8 @@ class _Comparison:
         """The better of no delay and that of the velocities to start with; for mirrored axes only
         where the windows then agree far better.
         """
-        rows, chosen = evenly(len(self.seconds), _SAMPLES), []
+        rows = evenly(len(self.seconds), _SAMPLES)
+        chosen = []
         for mirrored in (False, True):
             fits = [
                 self.fitted(mirrored, np.array([0.0, 0.0, about_s, 0.0]), free, rows, about_s)
@@ -231,7 +245,9 @@ class _Comparison:
         """The fit with a delay and a lever arm only where they matter, and each gains CERTAIN, or
         are the usual ones.
         """
-        rows, about_s, fits = np.arange(len(self.seconds)), float(fit.theta[2]), []
+        rows = np.arange(len(self.seconds))
+        about_s = float(fit.theta[2])
+        fits = []
         as_usual = self.fitted(fit.mirrored, self.usual, free & _SCALE, rows, self.usual[2])
         if as_usual and self.usual.any():
             fits.append((as_usual, 0.0))
@@ -256,7 +272,8 @@ class _Comparison:
         if fit is None or fit.unsteady > UNSTEADY:
             return fit
         for _ in range(3):
-            fit, before = self.settled(fit, free), self.used
+            fit = self.settled(fit, free)
+            before = self.used
             self.used = ~self.faults(fit)
             if (before == self.used).all():
                 break
@@ -267,14 +284,14 @@ class _Comparison:
         away from where the odometry puts them.
         """
         marker = self.marker(np.zeros(4) if fit is None else fit.theta, self.seconds)
-        step, way = np.abs(np.diff(self.places)), np.abs(np.diff(marker))
+        step = np.abs(np.diff(self.places))
+        way = np.abs(np.diff(marker))
         jump = np.append(False, faulty(step - way, FAULT_M) & (step > way))
-        held, part = np.append(False, step == 0), np.cumsum(jump)
+        held = np.append(False, step == 0)
+        part = np.cumsum(jump)
         run = _runs(part, held)
-        driven, jumps = (
-            np.bincount(run, np.append(0, way)),
-            np.bincount(run, np.append(jump[1:], 0)),
-        )
+        driven = np.bincount(run, np.append(0, way))
+        jumps = np.bincount(run, np.append(jump[1:], 0))
         mask = held & ((driven > FAULT_M) & (jumps > 0))[run]
         if fit is not None:
             off = np.zeros(len(held))
@@ -287,14 +304,17 @@ class _Comparison:
         """Where the used samples jump farther than the robot drives in as much time, up to a second
         before or after, in words; '' if they do not.
         """
-        seconds, places = self.seconds[self.used], self.places[self.used]
+        seconds = self.seconds[self.used]
+        places = self.places[self.used]
         shifted_s = seconds - fit.theta[2] + np.linspace(-1.0, 1.0, 11)[:, None]
-        step, way = np.abs(np.diff(places)), np.diff(np.interp(shifted_s, self.track_s, self.way))
+        step = np.abs(np.diff(places))
+        way = np.diff(np.interp(shifted_s, self.track_s, self.way))
         noise = np.hypot(np.sqrt(2) * fit.std, WHEELS_STD * way.max(0))  # of two samples
         far = step - way.max(0) > np.maximum(OUTLIER * noise, FAULT_M)
         if not far.any():
             return ''
-        first, often = int(np.argmax(far)), f'{far.sum()} times, first' if far.sum() > 1 else 'once'
+        first = int(np.argmax(far))
+        often = f'{far.sum()} times, first' if far.sum() > 1 else 'once'
         at_s = seconds[first + 1] - self.seconds[0]
         return f'jumps {often} by {step[first]:.2f} m after {at_s:.1f} s: was it started anew?'
 
@@ -303,7 +323,9 @@ class _Comparison:
         truth, and whether it has any.
         """
         moved = fit.facing != 0
-        rows, facing, usual = fit.rows[moved], fit.facing[moved], -1.0 if fit.mirrored else 1.0
+        rows = fit.rows[moved]
+        facing = fit.facing[moved]
+        usual = -1.0 if fit.mirrored else 1.0
         means = {
             sign: (np.exp(1j * sign * self.yaw[rows]) * facing.conj())[self.used[rows]].mean()
             for sign in (usual, -usual)
@@ -312,7 +334,8 @@ class _Comparison:
         if not abs(means[sign]) > ALIKE:
             by_wheels = np.interp(self.seconds, self.seconds[rows], np.unwrap(np.angle(facing)))
             return by_wheels, 'has no headings of base_link; they are not judged', False
-        turned, aside = '' if sign == usual else 'clockwise ', float(np.angle(means[sign]))
+        turned = '' if sign == usual else 'clockwise '
+        aside = float(np.angle(means[sign]))
         if abs(aside) < ASIDE:
             text = f'has {turned}headings; turned around' if turned else ''
             return sign * self.yaw, text, True
@@ -401,7 +424,8 @@ def timed_points(
     alike = fit and not fit.mirrored and fit.unsteady <= UNSTEADY
     if not fit or not alike or not 1 / EQUAL < comparison.scale() < EQUAL:
         return points, []
-    rows, lever = np.flatnonzero(comparison.used), complex(*fit.theta[:2])
+    rows = np.flatnonzero(comparison.used)
+    lever = complex(*fit.theta[:2])
     late_ns = round(fit.theta[2] * 1e9)
     timed = [
         (name, stamp_ns - late_ns, place, std, lever or known)

@@ -49,7 +49,8 @@ APART_M = 1.0
 """Images that are farther apart show other things, and match by chance."""
 CLOSURES_MIN = 30
 """Fewer closures do not show whether images turn better."""
-FACTOR_STD, BIAS_STD = 0.3, 0.003
+FACTOR_STD = 0.3
+BIAS_STD = 0.003
 """Priors: of the factor of wheels on any ground, and of a bias, rad/s."""
 FAR = 8.0
 """Standard deviations beyond which an error counts no more: images that match by chance."""
@@ -103,13 +104,16 @@ def estimated(drives: Sequence[Headings], closures: Closures) -> list[Turns] | N
     """
     if _odometry_is_better(drives, closures):
         return None
-    steps, prior = _Steps.of(drives), np.repeat([FACTOR_STD, BIAS_STD], len(drives)) ** -2
+    steps = _Steps.of(drives)
+    prior = np.repeat([FACTOR_STD, BIAS_STD], len(drives)) ** -2
     if steps.correlation < ALIKE:
         return None
-    noise, turns = NOISE_FIRST, steps.odometry + steps.more
+    noise = NOISE_FIRST
+    turns = steps.odometry + steps.more
     outlier = np.ones(len(steps.short))
     errors = steps.errors(steps.odometry)
-    more, counted = steps.summed(steps.more), steps.summed(errors)
+    more = steps.summed(steps.more)
+    counted = steps.summed(errors)
     for _ in range(_ROUNDS):
         by_odometry = steps.sources[:, :2] @ noise[:2] + steps.bridged
         total = by_odometry + steps.sources[:, 2:] @ noise[2:]
@@ -127,7 +131,8 @@ def estimated(drives: Sequence[Headings], closures: Closures) -> list[Turns] | N
         noise = steps.noise(residual, noise)
     variance = by_odometry * np.where(steps.unbroken, 1 - by_odometry / total, 1.0)
     covariance = np.linalg.inv((counted.T * weight) @ counted + np.diag(prior))
-    stds, ends = np.sqrt(np.diag(covariance)), np.cumsum([len(drive.track) - 1 for drive in drives])
+    stds = np.sqrt(np.diag(covariance))
+    ends = np.cumsum([len(drive.track) - 1 for drive in drives])
     parts = zip(np.split(add, ends[:-1]), np.split(variance, ends[:-1]), values, stds, strict=False)
     return [
         Turns(summed(added), summed(variances), Quantity(1 + float(value), float(std)))
@@ -137,7 +142,8 @@ def estimated(drives: Sequence[Headings], closures: Closures) -> list[Turns] | N
 
 def _odometry_is_better(drives: Sequence[Headings], closures: Closures) -> bool:
     """Whether odometry misses the turns of closures by less than images of either sign."""
-    start, misses = 0, [np.zeros((3, 0))]
+    start = 0
+    misses = [np.zeros((3, 0))]
     for drive in drives:
         rows = closures.images - start
         inside = np.flatnonzero(((rows >= 0) & (rows < len(drive.track))).all(1))
@@ -178,8 +184,10 @@ class _Steps:
             columns: list[NDArray[Any]] = [np.diff(getattr(drive, name)) for drive in drives]
             return np.concatenate(columns)
 
-        odometry, images = steps('track'), steps('images')
-        time_s, way_m = steps('time_s'), steps('way_m')
+        odometry = steps('track')
+        images = steps('images')
+        time_s = steps('time_s')
+        way_m = steps('way_m')
         unbroken = (steps('part') == 0) & (way_m <= APART_M)
         images = wrap_angle(images if images @ odometry >= 0 else -images)
         drive = np.repeat(np.arange(len(drives)), [len(each.track) - 1 for each in drives])
@@ -210,7 +218,8 @@ class _Steps:
     @property
     def correlation(self) -> float:
         """Of the turns of images and odometry."""
-        x, y = self.odometry[self.unbroken], (self.odometry + self.more)[self.unbroken]
+        x = self.odometry[self.unbroken]
+        y = (self.odometry + self.more)[self.unbroken]
         fastest = float(np.max(np.abs(x), initial=0.0))
         y = np.clip(y, -fastest, fastest)  # images that match by chance
         power = float(x @ x) * float(y @ y)
@@ -226,14 +235,17 @@ class _Steps:
         in_windows = np.add.reduceat(residual, self.windows)[whole]
         squares = np.append(residual[single], in_windows) ** 2
 
-        usual, spread = NOISE.copy(), NOISE_SPREAD.copy()
+        usual = NOISE.copy()
+        spread = NOISE_SPREAD.copy()
         if self.by_gyro:
-            usual[:2], spread[:2] = GYRO_NOISE, NOISE_SPREAD[2:]
+            usual[:2] = GYRO_NOISE
+            spread[:2] = NOISE_SPREAD[2:]
 
         def cost(logarithms: Array) -> tuple[float, Array]:
             noise = np.exp(logarithms)
             variance = rows @ noise
-            ratio, beside = squares / variance, (logarithms - np.log(usual)) / spread
+            ratio = squares / variance
+            beside = (logarithms - np.log(usual)) / spread
             near = np.minimum(ratio, FAR**2)
             slope = (1 - near) / variance @ rows * noise / 2 + beside / spread
             misfit = near * (1 + np.log(np.maximum(ratio / near, 1.0)))

@@ -37,9 +37,11 @@ from sfa_localization.mapping.driven_ground import Cells, DrivenGround
 
 _FIXED = np.diag([1e-6] * 6)
 """Covariance of z, roll and pitch, which a planar estimate fixes."""
-_PLANAR, _TWIST = np.ix_([0, 1, 5], [0, 1, 5]), np.ix_([0, 5], [0, 5])
+_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+_TWIST = np.ix_([0, 5], [0, 5])
 _CORRELATION = 'error_correlation'
-_RED_M, _LINE_M = 0.3, 0.05
+_RED_M = 0.3
+_LINE_M = 0.05
 """The expected error that is drawn red, and the width of the lines."""
 
 
@@ -58,7 +60,9 @@ def to_image(image: Image, stamp_ns: int, frame: str) -> ImageMessage:
     """A bgr8 message of an image (H, W, 3) uint8."""
     height, width = image.shape[:2]
     message = ImageMessage(header=_header(stamp_ns, frame), encoding='bgr8')
-    message.height, message.width, message.step = height, width, width * 3
+    message.height = height
+    message.width = width
+    message.step = width * 3
     message.data = array.array('B', image.tobytes())
     return message
 
@@ -148,7 +152,8 @@ def to_transform(
     require_sane('output', x, y, yaw)
     message = geometry.TransformStamped(header=_header(stamp_ns, frames[0]))
     message.child_frame_id = frames[1]
-    message.transform.translation.x, message.transform.translation.y = x, y
+    message.transform.translation.x = x
+    message.transform.translation.y = y
     message.transform.rotation = to_quaternion(yaw)
     return message
 
@@ -164,7 +169,8 @@ def to_array(values: ArrayLike, label: str) -> Float64MultiArray:
 def to_turned(yaw_rad: float, stamp_ns: int, frame: str) -> geometry.QuaternionStamped:
     """The rotation of images about the vertical, relative to any of them."""
     require_sane('output', yaw_rad)
-    header, quaternion = _header(stamp_ns, frame), to_quaternion(yaw_rad)
+    header = _header(stamp_ns, frame)
+    quaternion = to_quaternion(yaw_rad)
     return geometry.QuaternionStamped(header=header, quaternion=quaternion)
 
 
@@ -186,7 +192,8 @@ def to_grid(cells: Cells, stamp_ns: int, frame: str) -> OccupancyGrid:
 def to_lines(ground: DrivenGround, stamp_ns: int, frame: str) -> MarkerArray:
     """The paths of the training as lines: green where one image hardly errs, red from _RED_M on."""
     marker = Marker(header=_header(stamp_ns, frame), ns='driven', type=Marker.LINE_LIST)
-    marker.scale.x, marker.pose.orientation.w = _LINE_M, 1.0
+    marker.scale.x = _LINE_M
+    marker.pose.orientation.w = 1.0
     ends = ground.lines.ravel()
     marker.points = [geometry.Point(x=x, y=y) for x, y in ground.places[ends].tolist()]
     red = np.minimum(ground.expected_m[ends] / _RED_M, 1.0)
@@ -236,5 +243,6 @@ def _header(stamp_ns: int, frame: str) -> Header:
 def _fill(message: Any, pose: ArrayLike) -> None:
     x, y, yaw = np.asarray(pose, float).tolist()
     require_sane('output', x, y)
-    message.position.x, message.position.y = x, y
+    message.position.x = x
+    message.position.y = y
     message.orientation = to_quaternion(yaw if math.isfinite(yaw) else 0.0)

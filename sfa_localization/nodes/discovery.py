@@ -34,7 +34,10 @@ class Discovery:
         arguments: Sequence[str],
         take: Callable[[str], None] | None = None,
     ) -> None:
-        self._node, self._topic, self._arguments, self._types = node, topic, arguments, types
+        self._node = node
+        self._topic = topic
+        self._arguments = arguments
+        self._types = types
         self._start_s = steady_s()
         self._expected = node.resolve_topic_name(topic)
         self._take = None if node.is_remapped(topic) else take
@@ -67,7 +70,8 @@ class Discovery:
         ]
         usable = [n for n, kind in topics if kind == self._types[0] and self._qualifies(n)]
         if self._take is not None and len(usable) == 1:
-            self._has_substitute, self.hint = True, ''
+            self._has_substitute = True
+            self.hint = ''
             self._node.get_logger().warning(
                 f'nobody publishes on {self._expected}: taking {usable[0]}, the only '
                 f'{self._types[0]}; {self._arguments[0]}:={_TRANSPORT.sub("", usable[0])} '
@@ -78,7 +82,8 @@ class Discovery:
         listed = ', '.join(f'{name} ({kind})' for name, kind in topics)
         choices = ' or '.join(f'{argument}:=NAME' for argument in self._arguments)
         hint = f'nobody publishes on {self._expected}; there are {listed}: {choices}'
-        before, self.hint = self.hint, hint if listed else ''
+        before = self.hint
+        self.hint = hint if listed else ''
         if self.hint not in ('', before):
             self._node.get_logger().warning(self.hint)
 

@@ -43,9 +43,12 @@ try:
 except ImportError:  # without Nav2 nobody calls it
     SetInitialPose = None
 
-_OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+_OK = DiagnosticStatus.OK
+_WARN = DiagnosticStatus.WARN
+_ERROR = DiagnosticStatus.ERROR
 _LEVELS = dict(zip(Level, (_WARN, _OK, _WARN, _ERROR), strict=True))
-PATH_PERIOD_S, PATH_LENGTH = 0.5, 2000
+PATH_PERIOD_S = 0.5
+PATH_LENGTH = 2000
 """Time between the poses of ekf/path, and their largest number: 17 minutes."""
 IMAGES_SILENCE = 3.0
 """Images may be silent this many times longer than odometry, because they come less often."""
@@ -56,7 +59,8 @@ _REPEAT_STATE_S = 0.9  # between states of the same level with other reasons
 _OFF_GRID_NS = 500  # added to transforms of the future: tf2 rejects a stamp that it has already
 _BACKWARD_JUMP_NS = -500_000_000  # of simulated time; less is jitter
 NO_POSE = 'its pose is not filled: only the twist is used, and map -> odom is not published'
-_ODOM, _IMAGE_POSE = 'odom', 'sfa/pose_with_covariance'
+_ODOM = 'odom'
+_IMAGE_POSE = 'sfa/pose_with_covariance'
 
 
 class EkfNode(LocalizationNode):
@@ -150,12 +154,14 @@ class EkfNode(LocalizationNode):
 
     def _subscribe_odometry(self, substitute: str = '') -> None:
         self.unsubscribe(self._odometry_input)
-        receive, qos = self._receive_odometry, sensor_qos(100)
+        receive = self._receive_odometry
+        qos = sensor_qos(100)
         self._odometry_input = self.subscribe(Odometry, _ODOM, receive, qos, substitute)
 
     def _receive_odometry(self, message: Odometry) -> None:
         stamp_ns, (v, omega, *noise), pose = convert.read_odometry(message)
-        frame, child_frame = message.header.frame_id, message.child_frame_id
+        frame = message.header.frame_id
+        child_frame = message.child_frame_id
         self._frames = frame or self._config.odom_frame, child_frame or self._config.base_frame
         reason = self.filter.add_odometry(stamp_ns, v, omega, noise, pose)
         if reason:
@@ -195,7 +201,8 @@ class EkfNode(LocalizationNode):
 
     def _set_pose(self, message: geometry.PoseWithCovarianceStamped) -> None:
         if message.header.stamp.sec == 0 and message.header.stamp.nanosec == 0:
-            state, now_ns = self.filter.state, int(self.get_clock().now().nanoseconds)
+            state = self.filter.state
+            now_ns = int(self.get_clock().now().nanoseconds)
             stamp_ns = state.stamp_ns if state is not None else max(now_ns, 1)
             message.header.stamp = convert.to_stamp(stamp_ns)
         stamp_ns, pose, covariance = self._read_in_map(message)
@@ -212,7 +219,8 @@ class EkfNode(LocalizationNode):
     def _reset(self, _: Any, response: Any) -> Any:
         self._forget()
         self._publish_state()
-        response.success, response.message = True, self.status().level.name
+        response.success = True
+        response.message = self.status().level.name
         return response
 
     def _forget_pose(self, _: Any) -> None:
@@ -247,7 +255,8 @@ class EkfNode(LocalizationNode):
 
     def _save_pose(self) -> None:
         """Write the last reliable pose, if it is new."""
-        state, self._reliable = self._reliable, None
+        state = self._reliable
+        self._reliable = None
         if state is not None and self._config.pose_file:
             pose = state.pose, state.pose_covariance
             saved = SavedPose(state.stamp_ns, self._config.map_frame, *pose)
@@ -265,7 +274,8 @@ class EkfNode(LocalizationNode):
     # Outputs.
 
     def _publish_odometry(self, state: State) -> None:
-        pose, twist = (state.pose, state.pose_covariance), (state.twist, state.twist_covariance)
+        pose = (state.pose, state.pose_covariance)
+        twist = (state.twist, state.twist_covariance)
         frames = self._config.map_frame, self._frames[1]
         self._odometry.publish(convert.to_odometry(*pose, *twist, state.stamp_ns, frames))
 
@@ -274,7 +284,8 @@ class EkfNode(LocalizationNode):
 
         A lookup of the present needs a transform from the future.
         """
-        frames, stamp_ns = (self._config.map_frame, self._frames[0]), state.stamp_ns
+        frames = (self._config.map_frame, self._frames[0])
+        stamp_ns = state.stamp_ns
         map_to_odom = compose(state.pose, invert(np.array(odom)))
         transforms = [convert.to_transform(map_to_odom, stamp_ns, frames)]
         self._transform.publish(transforms[0])
@@ -299,24 +310,29 @@ class EkfNode(LocalizationNode):
         """Publish the estimate at the stamp of an image."""
         state = self.filter.at(stamp_ns)
         if state is not None:
-            pose, frame = (state.pose, state.pose_covariance), self._config.map_frame
+            pose = (state.pose, state.pose_covariance)
+            frame = self._config.map_frame
             self._pose.publish(convert.to_pose_with_covariance(*pose, stamp_ns, frame))
 
     def _extend_path(self, state: State) -> None:
         if abs(state.stamp_ns - self._path_ns) < PATH_PERIOD_S * 1e9:
             return
-        self._path_ns, frame = state.stamp_ns, self._config.map_frame
+        self._path_ns = state.stamp_ns
+        frame = self._config.map_frame
         self._path.append(convert.to_pose(state.pose, state.stamp_ns, frame))
         if self._trail.get_subscription_count():
             self._trail.publish(Path(header=self._path[-1].header, poses=list(self._path)))
 
     def status(self) -> Status:
         """The filter's status, with the reasons that the wall clock gives, as silent inputs."""
-        status, reasons = self.filter.status, []
-        by_now, running_s = self._by_now(), steady_s() - self._configured_s
+        status = self.filter.status
+        reasons = []
+        by_now = self._by_now()
+        running_s = steady_s() - self._configured_s
         timeout_s = self._config.silence_timeout
         for topic, limit in ((_ODOM, timeout_s), (_IMAGE_POSE, IMAGES_SILENCE * timeout_s)):
-            silent, name = self.monitors[topic].silent_for_s(), self.full_name(topic)
+            silent = self.monitors[topic].silent_for_s()
+            name = self.full_name(topic)
             if min(silent, running_s) > limit and not self.count_publishers(name):
                 reasons.append(f'nobody publishes on {name}')
             elif limit < silent < math.inf:
@@ -327,7 +343,8 @@ class EkfNode(LocalizationNode):
             self.get_logger().warning(reasons[-1], throttle_duration_sec=_LOG_S)
         if self._paused:
             reasons.append('paused: images are not fused')
-        lost, behind_s = [], self._behind_s()
+        lost = []
+        behind_s = self._behind_s()
         if behind_s > timeout_s:
             reasons.append(f'behind by {behind_s:.1f} s: this computer is too busy')
             self.get_logger().warning(reasons[-1], throttle_duration_sec=_LOG_S)
@@ -364,7 +381,8 @@ class EkfNode(LocalizationNode):
         reasons = '; '.join(status.reasons)
         text = f'{status.level.name}: {reasons}' if reasons else status.level.name
         level, before, published_s = self._published_state
-        changed, now_s = status.level is not level, steady_s()
+        changed = status.level is not level
+        now_s = steady_s()
         if changed or (text != before and now_s > published_s + _REPEAT_STATE_S):
             self._published_state = status.level, text, now_s
             self._state.publish(String(data=text))
@@ -372,7 +390,8 @@ class EkfNode(LocalizationNode):
             self.get_logger().info(text)
 
     def health(self) -> tuple[int, str, dict[str, str]]:
-        status, state = self.status(), self._by_now()
+        status = self.status()
+        state = self._by_now()
         values = {'state': status.level.name, 'behind [s]': f'{self._behind_s():.2f}'}
         values.update({name: str(n) for name, n in sorted(self.filter.counts.items())})
         if state is not None:

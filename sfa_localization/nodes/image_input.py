@@ -33,7 +33,9 @@ class ImageInput:
         topic: str,
         use: Callable[[int, Image, str], None],
     ) -> None:
-        self._node, self._topic, self._use = node, topic, use
+        self._node = node
+        self._topic = topic
+        self._use = use
         self._kind = _message_class(transport)
         self.types = sorted(TRANSPORTS.values(), key=lambda kind: kind != TRANSPORTS[transport])
         """Types of image messages, this input's first."""
@@ -43,7 +45,8 @@ class ImageInput:
 
     def start(self, substitute: str = '') -> None:
         """Subscribe to the topic, or to a substitute for it."""
-        self._reader, self._substitute = ImageReader(self._kind.__name__), substitute
+        self._reader = ImageReader(self._kind.__name__)
+        self._substitute = substitute
         depth, entity = (_PACKETS, 'video') if self._holds_video else (1, None)
         self._subscription = self._node.subscribe(
             self._kind, self._topic, self._receive, sensor_qos(depth), substitute, entity

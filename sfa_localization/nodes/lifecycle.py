@@ -42,7 +42,8 @@ DIAGNOSTICS_PERIOD_S = 1.0
 """Time between messages on /diagnostics: diagnostic_aggregator expects about one a second."""
 _WAKE_PERIOD_S = 0.5  # a signal just before the executor waits does not always wake it
 S = TypeVar('S', bound=Settings)
-_SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+_SUCCESS = TransitionCallbackReturn.SUCCESS
+_FAILURE = TransitionCallbackReturn.FAILURE
 
 
 def sensor_qos(depth: int = 5) -> QoSProfile:
@@ -307,12 +308,14 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         if not self.active:
             return
         level, text, values = self.health()
-        stamp, is_simulated = self.get_clock().now(), self.get_parameter('use_sim_time').value
+        stamp = self.get_clock().now()
+        is_simulated = self.get_parameter('use_sim_time').value
         patient = steady_s() < self._configured_s + PATIENCE_S
         if is_simulated and not stamp.nanoseconds and not patient:
             problem = 'use_sim_time is true, but there is no time on /clock: play bags with --clock'
             self.refuse('/clock', problem)
-            level, text = max(level, DiagnosticStatus.WARN), f'{problem}; {text}'
+            level = max(level, DiagnosticStatus.WARN)
+            text = f'{problem}; {text}'
         for topic, monitor in self.monitors.items():
             values.update(monitor.values(f'{self.full_name(topic)}: '))
         message = self.diagnostic('status', level, text, values, stamp.to_msg())

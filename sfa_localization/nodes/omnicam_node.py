@@ -44,10 +44,14 @@ from sfa_localization.place_model import camera_of
 
 _DEMAND_PERIOD_S = 0.1  # between checks for subscribers: a new one waits no longer for images
 _LITTLE_VISIBLE = 0.5  # a smaller visible share of the panorama gives a warning
-_IMU, _ORIENTATIONS = 'imu/data', 500  # the number kept: those of a second or more
+# the number kept: those of a second or more
+_IMU = 'imu/data'
+_ORIENTATIONS = 500
 _CAMERA_INFO = 'camera_info'
 _JPEG_QUALITY = 90  # percent: no visible artifacts, a tenth of the raw size
-_OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+_OK = DiagnosticStatus.OK
+_WARN = DiagnosticStatus.WARN
+_ERROR = DiagnosticStatus.ERROR
 
 
 class OmnicamNode(lifecycle.LocalizationNode):
@@ -99,7 +103,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         if capture.source == 'topic':
             self.require_input(self._input)
             self._images = ImageInput(self, transport, self._input, self._publish)
-            types, arguments = self._images.types, ('image', 'panorama')
+            types = self._images.types
+            arguments = ('image', 'panorama')
             self.discovery = Discovery(self, self._input, types, arguments, self._take)
         else:
             self._input = capture.source_path
@@ -156,7 +161,9 @@ class OmnicamNode(lifecycle.LocalizationNode):
             self._listening_since_s = steady_s()
             self._images.start(self._substitute)
             if self._lens is None and not self.settings(CameraConfig).is_described:
-                take, qos, topic = self._take_calibration, lifecycle.sensor_qos(1), self._info_topic
+                take = self._take_calibration
+                qos = lifecycle.sensor_qos(1)
+                topic = self._info_topic
                 self._calibrations = self.subscribe(CameraInfo, _CAMERA_INFO, take, qos, topic)
 
     @property
@@ -173,7 +180,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         if self._lens is None:
             unwrapper = self._new_unwrapper(self._settings, lens)
             unwrapper.check(self._size)
-            self._lens, self._unwrapper = lens, unwrapper
+            self._lens = lens
+            self._unwrapper = unwrapper
             camera = f'{lens.camera_model} camera of {lens.image_width} x {lens.image_height}'
             self.get_logger().info(f'{self.full_name(_CAMERA_INFO)} describes a {camera} pixels')
         elif lens != self._lens:
@@ -217,7 +225,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._publish(stamp_ns, image, '')
 
     def _take_orientation(self, message: Imu) -> None:
-        stamp_ns, tilt = read_stamp(message.header.stamp), read_tilt(message)
+        stamp_ns = read_stamp(message.header.stamp)
+        tilt = read_tilt(message)
         if self._tilts and stamp_ns <= self._tilts[-1][0]:
             self._tilts.clear()  # time has stepped back
         self._tilts.append((stamp_ns, *tilt))
@@ -262,7 +271,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
                 self._info.publish(convert.to_info(self._panorama))
 
     def _new_unwrapper(self, settings: Current, lens: LensCalibration | None = None) -> Unwrapper:
-        camera, panorama = settings[CameraConfig], self._trained or settings[PanoramaConfig]
+        camera = settings[CameraConfig]
+        panorama = self._trained or settings[PanoramaConfig]
         return Unwrapper(cast(CameraConfig, camera), cast(PanoramaConfig, panorama), lens)
 
     def health(self) -> tuple[int, str, dict[str, str]]:
@@ -277,7 +287,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def _judge_source(self, details: dict[str, str]) -> tuple[int, str]:
         if self._feed is not None:
             status = self._feed.status()
-            details['source'], details['source lost'] = status.state, str(status.lost)
+            details['source'] = status.state
+            details['source lost'] = str(status.lost)
             if status.state == 'lost':
                 return _ERROR, f'camera lost, will be opened again: {status.problem}'
             if status.state == 'opening':
@@ -293,7 +304,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         return _OK, ''
 
     def _judge_images(self, details: dict[str, str]) -> tuple[int, str]:
-        frozen_s, monitor = self._frozen.frozen_for_s(), self.monitors[self._input]
+        frozen_s = self._frozen.frozen_for_s()
+        monitor = self.monitors[self._input]
         if frozen_s:
             return _WARN, f'the camera has repeated its last image for {frozen_s:.0f} s'
         if monitor.received and not monitor.used:

@@ -116,8 +116,10 @@ def warn_of_arguments(node: Node, words: Sequence[str]) -> None:
 
     ROS takes `ekf_node:` for a node without namespace, and gives /robot1/ekf_node nothing of it.
     """
-    name, logger = node.get_fully_qualified_name(), node.get_logger()
-    declared, given = node.list_parameters([], 0).names, set()
+    name = node.get_fully_qualified_name()
+    logger = node.get_logger()
+    declared = node.list_parameters([], 0).names
+    given = set()
     for flag, value in itertools.pairwise(words):
         if flag in ('-p', '--param'):
             given.add(value.partition(':=')[0].rpartition(':')[2])
@@ -143,7 +145,8 @@ def resolve_beside_file(node: Node, current: Current, words: Sequence[str]) -> b
     """
     if CameraConfig not in current:
         return False
-    pairs, given = [*itertools.pairwise(words)], 'calibration_file'
+    pairs = [*itertools.pairwise(words)]
+    given = 'calibration_file'
     if any(flag in ('-p', '--param') and value.startswith(given) for flag, value in pairs):
         return False
     for file in reversed([value for flag, value in pairs if flag == '--params-file']):
@@ -175,7 +178,8 @@ def _descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
     descriptor.type = _typed(item, Parameter(item.name, value=item.default)).type_.value
     if meta['choices']:
         descriptor.additional_constraints = 'one of: ' + ', '.join(filter(None, meta['choices']))
-    low, high = meta['low'], meta['high']
+    low = meta['low']
+    high = meta['high']
     if low is None or high is None:
         return descriptor
     if isinstance(item.default, float):

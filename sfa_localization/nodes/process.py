@@ -11,6 +11,7 @@ NODES = {
     'sfa_node': 'ROS 2 node: panoramas to slow features and poses.',
     'ekf_node': 'ROS 2 node: poses and odometry to the pose in the map.',
 }
-CANNOT_START, DIED = 1, 2
+CANNOT_START = 1
+DIED = 2
 """Exit codes: a launch ends if a node cannot start, and restarts a node that died."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)

@@ -17,7 +17,8 @@ from sfa_localization.fusion.inputs import read_pose
 
 SAVE_PERIOD_S = 10.0
 """Time between two writes: rare enough for a flash card to last for years."""
-MOVED_STD_M, MOVED_YAW_STD = 0.5, 0.3
+MOVED_STD_M = 0.5
+MOVED_YAW_STD = 0.3
 """m and rad by which a robot may be moved while it is off, as when it is pushed to its charger. The
 pose is a hypothesis: images overrule it where the robot was moved farther."""
 _LARGEST_FILE = 65536  # bytes, many times the size of a pose

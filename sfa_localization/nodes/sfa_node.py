@@ -39,8 +39,11 @@ from sfa_localization.nodes.settings import SfaNodeConfig
 from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 
-_FEATURE_FRAME, _TURNED_FRAME = 'slow_feature_space', 'first_image'
-_OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+_FEATURE_FRAME = 'slow_feature_space'
+_TURNED_FRAME = 'first_image'
+_OK = DiagnosticStatus.OK
+_WARN = DiagnosticStatus.WARN
+_ERROR = DiagnosticStatus.ERROR
 
 
 class SfaNode(LocalizationNode):
@@ -100,7 +103,8 @@ class SfaNode(LocalizationNode):
         if isinstance(settings, WatchConfig) and self._observer is not None:
             self._observer.watch.config = settings
         if isinstance(settings, SfaNodeConfig):
-            before, self._config = self._config, settings
+            before = self._config
+            self._config = settings
             if settings.model != before.model and self._loaded is not None:
                 self._use(self._loaded)
             self._loaded = None
@@ -113,13 +117,15 @@ class SfaNode(LocalizationNode):
 
     def _reload(self, _: Any, response: Any) -> Any:
         self._use(self._load(self._config.model))
-        response.success, response.message = True, f'loaded {self._config.model}'
+        response.success = True
+        response.message = f'loaded {self._config.model}'
         return response
 
     def _publish_map(self) -> None:
         """Publish where the robot drove in training, and what ekf_node needs to know."""
         assert self._observer is not None
-        model, frame = self._observer.model, self._config.map_frame
+        model = self._observer.model
+        frame = self._config.map_frame
         now_ns = self.get_clock().now().nanoseconds
         self._rig.publish(convert.to_rig(model.rig, model.error_correlation))
         self._map.publish(convert.to_grid(model.ground.cells(GroundConfig()), now_ns, frame))
@@ -153,7 +159,9 @@ class SfaNode(LocalizationNode):
 
     def _publish(self, seen: Observation) -> None:
         """Publish an observation; a pose of an unusable image only with its large covariance."""
-        frame, slow, stamp_ns = self._config.map_frame, seen.slow_features, seen.stamp_ns
+        frame = self._config.map_frame
+        slow = seen.slow_features
+        stamp_ns = seen.stamp_ns
         if np.all(np.isfinite(slow)):
             self._features.publish(convert.to_array(slow, 'slow features'))
             self._feature_pose.publish(_feature_pose(slow, stamp_ns))
@@ -167,12 +175,15 @@ class SfaNode(LocalizationNode):
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         assert self._observer is not None
-        values, explained = {'model': self._config.model}, 1.0
+        values = {'model': self._config.model}
+        explained = 1.0
         if self._last is not None:
-            explained, factor = self._last.explained, self._observer.slow_error_factor
+            explained = self._last.explained
+            factor = self._observer.slow_error_factor
             values['explained'] = f'{100 * explained:.0f} %'
             values['slow feature errors'] = f'{factor:.1f} times as in training'
-        monitor, topic = self.monitors[self._topic], self.full_name(self._topic)
+        monitor = self.monitors[self._topic]
+        topic = self.full_name(self._topic)
         silent = monitor.silent_for_s()
         if math.isinf(silent):
             return _WARN, self.discovery.hint or f'waiting for images on {topic}', values

@@ -210,7 +210,8 @@ def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Sco
 
 def _draw_position_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -> None:
     for name, estimate in estimates.items():
-        errors, style = errors_of(truth, estimate), STYLES.get(name, OTHER)
+        errors = errors_of(truth, estimate)
+        style = STYLES.get(name, OTHER)
         axes.plot(errors.seconds, errors.position_m, label=_label(name), **style)
     axes.set(xlabel='time (s)', ylabel='position error (m)', xlim=(0, None), ylim=(0, None))
     axes.grid(alpha=0.3)
@@ -254,7 +255,8 @@ def _bulk(estimate: Trajectory) -> Array:
 def _frame_view(axes: Axes, points: Array) -> None:
     """Equal axes in meters, limited to the points and a margin."""
     if len(points):
-        low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M
+        low = points.min(axis=0) - MARGIN_M
+        high = points.max(axis=0) + MARGIN_M
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_aspect('equal')
     axes.set(xlabel='x (m)', ylabel='y (m)')
@@ -308,7 +310,8 @@ def write_evaluation_page(
 
 def judgment(scores: Scores, counts: Mapping[str, Any]) -> tuple[str, str]:
     """The grade of an evaluation, and a sentence about it."""
-    mean, wheels = scores['ekf']['mean'], scores['odometry']['mean']
+    mean = scores['ekf']['mean']
+    wheels = scores['odometry']['mean']
     if mean is None:
         return page.BAD, 'The filter did not start, or the truth covers none of its estimates.'
     if counts['false_localised_s'] > 0:
@@ -327,7 +330,9 @@ def _trust(row: Mapping[str, Any]) -> tuple[str, bool]:
     """Whether the squared errors of an estimate are as its covariances say, in words, and whether
     these are large enough.
     """
-    share, ratio, expected = row.get('within_95'), row.get('nees'), row.get('nees_right')
+    share = row.get('within_95')
+    ratio = row.get('nees')
+    expected = row.get('nees_right')
     if share is not None and share < TRUSTED_SHARE:
         return 'but the covariances are too small.', False
     if ratio is None or expected is None or expected[0] <= ratio <= expected[1]:

@@ -67,7 +67,8 @@ def worst_images(
     """The images at places (M, 2) m with the largest errors (M,) m, `distance_m` or more from each
     other.
     """
-    rest, worst = np.ones(len(errors), bool), list[WorstImage]()
+    rest = np.ones(len(errors), bool)
+    worst = list[WorstImage]()
     while rest.any() and len(worst) < count:
         row = int(np.argmax(np.where(rest, errors, -np.inf)))
         x, y = places[row].tolist()

@@ -60,7 +60,8 @@ def _order(result: Mapping[str, Any]) -> tuple[int, float]:
 
 def _row(folder: Path, result: Mapping[str, Any], now_s: float) -> str:
     """The cells of a garden, with links to all pages in its folder."""
-    name, trained_s = result['garden'], result.get('trained_s')
+    name = result['garden']
+    trained_s = result.get('trained_s')
     pages = sorted(file.parent.name for file in (folder / name).glob(f'*/{page.PAGE}'))
     numbers = {
         '.2f': result.get('expected_error_m'),

@@ -12,8 +12,12 @@ from sfa_localization.inspection import InspectionConfig, too_sparse
 from sfa_localization.motion.sources import MAP
 from sfa_localization.training import Trained
 
-GOOD, WEAK, BAD = 'good', 'weak', 'bad'
-GOOD_M, USEFUL_M, GOOD_DEG = 0.5, 2.0, 11.5
+GOOD = 'good'
+WEAK = 'weak'
+BAD = 'bad'
+GOOD_M = 0.5
+USEFUL_M = 2.0
+GOOD_DEG = 11.5
 """Expected errors of an image at which a filter with default limits is DEGRADED and LOST (m), and
 DEGRADED by its heading (degrees)."""
 TRUSTED_SHARE = 0.9

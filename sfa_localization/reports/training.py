@@ -38,7 +38,8 @@ _CAPTIONS = {
 
 def worst_of(trained: Trained) -> dict[WorstImage, tuple[int, int]]:
     """Run and stamp of the images with the largest distance between map and segment."""
-    images, places = trained.metric.images, trained.metric.poses[:, :2]
+    images = trained.metric.images
+    places = trained.metric.poses[:, :2]
     stamps = [
         (number, stamp)
         for number, run in enumerate(trained.runs)
@@ -59,7 +60,8 @@ def write_training_report(
 
     Raises LocalizationError if a file cannot be written.
     """
-    images, places = trained.metric.images, trained.metric.poses[:, :2]
+    images = trained.metric.images
+    places = trained.metric.poses[:, :2]
     coverage_figure(folder / 'coverage.png', trained, places)
     line_fits_figure(folder / 'line_fits.png', trained, places)
     firing_maps_figure(folder / 'firing_maps.png', places, trained.features[images])
@@ -126,7 +128,8 @@ def trust_lines(trained: Trained) -> list[str]:
 
 def advice(trained: Trained, places: Array) -> list[str]:
     """What to drive next, most useful first; images were taken at places (M, 2) m."""
-    diagnostics, forecast = trained.metric.diagnostics, trained.metric.forecast
+    diagnostics = trained.metric.diagnostics
+    forecast = trained.metric.forecast
     lines = [
         f'Cross x {x:.1f} m, y {y:.1f} m, in two directions.' for x, y, *_ in weak_places(forecast)
     ]

@@ -90,7 +90,8 @@ def build_flow(mdp: Any, architecture: Architecture, relative_cut: float) -> Any
     nodes: list[Any] = []
     rows = architecture.map_rows
     for depth, layer in enumerate(architecture.layers):
-        receptive, channels = architecture.fields[depth], architecture.channels[depth]
+        receptive = architecture.fields[depth]
+        channels = architecture.channels[depth]
         shape = (rows[depth], architecture.rotations, channels)
         wires = connections(shape, receptive)
         nodes += _layer(mdp, layer, int(np.prod(shape)), wires, relative_cut)

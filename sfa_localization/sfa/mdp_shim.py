@@ -56,7 +56,8 @@ def _repaired() -> Iterator[None]:
     """Provide numpy.typeDict, and let inspect.getfullargspec answer for any function, inside the
     block.
     """
-    ask, lacks = inspect.getfullargspec, 'typeDict' not in vars(np)
+    ask = inspect.getfullargspec
+    lacks = 'typeDict' not in vars(np)
 
     def answer(func: object) -> inspect.FullArgSpec:
         try:

@@ -109,7 +109,8 @@ def _check(architecture: Architecture) -> None:
         raise ConfigError('a network has layers, whose sizes are whole numbers above 0')
     if architecture.normalization not in _NORMALIZATIONS:
         raise ConfigError(f'unknown normalization: use {", ".join(NORMALIZATIONS)}')
-    first, columns = architecture.layers[0], architecture.grid[1]
+    first = architecture.layers[0]
+    columns = architecture.grid[1]
     if first.field[1] % first.stride[1] or columns % first.stride[1]:
         raise ConfigError(
             f'a grid {columns} wide and fields {first.field[1]} wide do not hold whole strides of '
@@ -207,7 +208,8 @@ def resampled(image: Image, grid: tuple[int, int]) -> Image:
     along an axis with more pixels than the grid, interpolated along one with fewer.
     """
     rows, columns = grid
-    height, width = min(image.shape[0], rows), min(image.shape[1], columns)
+    height = min(image.shape[0], rows)
+    width = min(image.shape[1], columns)
     if image.shape[:2] != (height, width):
         image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
     if (height, width) == grid:
@@ -264,7 +266,8 @@ class Network:
 
     def layer(self, maps: Map, depth: int) -> Map:
         """Output map of layer `depth` (0-based) from the map below."""
-        node, layer = self.nodes[depth], self.architecture.layers[depth]
+        node = self.nodes[depth]
+        layer = self.architecture.layers[depth]
         receptive = self.architecture.fields[depth]
         above = []
         for below in maps:  # the monomials of all images at once would need much memory
@@ -295,6 +298,7 @@ def check_weights(network: Network) -> None:
     )
     for depth, (node, layer, receptive, channels) in enumerate(levels, 1):
         inputs = receptive.rows * receptive.columns * channels
-        linear, slow = (inputs, layer.linear), (layer.expanded, layer.outputs)
+        linear = (inputs, layer.linear)
+        slow = (layer.expanded, layer.outputs)
         if (node.linear.shape, node.slow.shape) != (linear, slow):
             raise ModelError(f'the weights of layer {depth} do not fit its sizes')

@@ -206,8 +206,10 @@ def stage_sums(partial: Partial, shard: Shard) -> Sums:
 
 def _sums(partial: Partial) -> Sums:
     """Empty sums for the next stage."""
-    architecture, depth = partial.architecture, partial.depth
-    layer, receptive = architecture.layers[depth], architecture.fields[depth]
+    architecture = partial.architecture
+    depth = partial.depth
+    layer = architecture.layers[depth]
+    receptive = architecture.fields[depth]
     if partial.linear is not None:
         return SampleStatistics(architecture.rotations, layer.expanded, partial.rotate)
     strip = receptive.rows * architecture.channels[depth]
@@ -246,7 +248,8 @@ def shards_of(
     for number, s in enumerate(sequences):
         count = len(s.panoramas)
         for start in range(0, count, SHARD):
-            stop, end = min(start + used, count), min(start + SHARD, count)
+            stop = min(start + used, count)
+            end = min(start + SHARD, count)
             shards.append(Shard(s, start, stop, end, light_std, (seed, number)))
     return shards
 

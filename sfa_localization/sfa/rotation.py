@@ -136,15 +136,18 @@ class FieldStatistics:
         self.between += other.between
 
     def result(self) -> Statistics:
-        count, r = self.samples * self.rotations, self.rotations
+        count = self.samples * self.rotations
+        r = self.rotations
         steps = self.pairs + (self.samples * (r - 1) if self.rotate else 0)
         total = np.tile(self.total, self.field.columns)
-        second, difference = self._blocks(self._lag), self._blocks(self._difference)
+        second = self._blocks(self._lag)
+        difference = self._blocks(self._difference)
         return Statistics(float(count), total, second, float(steps), difference)
 
     def _blocks(self, block_of: Callable[[int], Array]) -> Array:
         """Assemble (D, D) from the blocks of column lags l >= 0."""
-        p, n = len(self.total), self.field.columns
+        p = len(self.total)
+        n = self.field.columns
         out = np.empty((n, p, n, p))
         for lag in range(n):
             block = block_of(lag * self.field.spacing)
@@ -162,11 +165,13 @@ class FieldStatistics:
         return within * ((r - 1) / r) + self._lag_between(lag) / r
 
     def _lag(self, lag: int) -> Array:
-        p, at = len(self.total), self.lags.index(lag)
+        p = len(self.total)
+        at = self.lags.index(lag)
         return self.same[:, at * p : (at + 1) * p]
 
     def _lag_between(self, lag: int) -> Array:
-        p, at = len(self.total), lag // self.field.spacing
+        p = len(self.total)
+        at = lag // self.field.spacing
         return self.between[:, at * p : (at + 1) * p]
 
 
@@ -178,7 +183,8 @@ def _between_images(signals: Map, last: Map | None, joined: Mask, rotate: bool, 
     if last is None:
         seconds = seconds[seconds > 0]
     else:
-        signals, seconds = np.concatenate([last, signals], axis=time), seconds + 1
+        signals = np.concatenate([last, signals], axis=time)
+        seconds = seconds + 1
     before = np.roll(signals.take(seconds - 1, axis=time), int(rotate), axis=time + 2)
     return np.asarray(signals.take(seconds, axis=time) - before)
 

@@ -42,7 +42,8 @@ class Daylight:
 
     def toward_sun(self, rng: np.random.Generator) -> Array:
         """Unit vector (3,) toward the sun in the frame `world`; `rng` draws the garden's sun."""
-        azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(32, 52))
+        azimuth = rng.uniform(0, 2 * np.pi)
+        elevation = np.radians(rng.uniform(32, 52))
         if self.elevation_deg is not None:
             elevation = np.radians(self.elevation_deg)
         azimuth += np.radians(self.turn_deg)

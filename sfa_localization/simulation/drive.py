@@ -46,7 +46,8 @@ _DRIFT_FACTOR_MAX = 5.0  # in each iteration
 _NO_DRIFT_M = 0.01  # a smaller drift cannot be scaled
 ROUTE_STREAM, SENSOR_STREAM, LIGHT_STREAM, PIXEL_STREAM, FRAME_STREAM, GROUND_STREAM = range(6)
 _FRAME_REACH_M = 50.0  # largest distance from the odometry frame to the start of the recording
-WAVES, WAVES_M = 12, (1.5, 6.0)
+WAVES = 12
+WAVES_M = (1.5, 6.0)
 """Number of waves that make up uneven ground, and their lengths: a robot bridges shorter ones."""
 SWAY = 0.25
 """Random tilt of each image as a share of the slope."""
@@ -128,7 +129,8 @@ def _profile(distance: float, speed: float, acceleration: float, dt: float) -> A
     total = distance / speed + ramp
     count = max(1, int(np.ceil(total / dt)))
     t = np.linspace(0, total, count + 1)
-    rising, falling = np.minimum(t, ramp), np.maximum(t - (total - ramp), 0)
+    rising = np.minimum(t, ramp)
+    falling = np.maximum(t - (total - ramp), 0)
     steady = np.clip(t - ramp, 0, total - 2 * ramp)
     covered = acceleration * rising**2 / 2 + speed * steady + speed * falling
     return np.asarray(covered - acceleration * falling**2 / 2)
@@ -219,7 +221,8 @@ def render_images(
     garden: Garden, drive: SimulatedDrive, config: SimulationConfig, view: View
 ) -> Iterator[Image]:
     """The noisy images of a drive in order, rendered by a thread per core."""
-    poses, light = drive.image_poses, lights(drive.image_stamps_ns, config)
+    poses = drive.image_poses
+    light = lights(drive.image_stamps_ns, config)
 
     def take(index: int) -> Image:
         pose = poses[index]
@@ -294,7 +297,9 @@ def _write(
     topic = '/panorama' if config.images == 'panorama' else '/image_raw'
     topic += '/compressed' if compressed else ''
     image = partial(bag.image, frame_id='camera', compressed=compressed)
-    odometry, gyro, truth = drive.odometry, drive.yaw_rate, drive.truth
+    odometry = drive.odometry
+    gyro = drive.yaw_rate
+    truth = drive.truth
     driven = odometry.poses, odometry.twists, odometry.variances
     entries = heapq.merge(
         _entries(bag.odometry, '/odom', odometry.stamps_ns, *driven),

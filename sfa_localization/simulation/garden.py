@@ -76,8 +76,12 @@ def box(
     center: Array, size: Array, surface: str, tint: Tint, low: float = 0.0, step: float = 0.5
 ) -> list[Shape]:
     """An upright box without a bottom: `center` (x, y), `size` (x, y, height) in meters."""
-    (x, y), (w, d, h) = center, size
-    west, east, south, north = x - w / 2, x + w / 2, y - d / 2, y + d / 2
+    (x, y) = center
+    (w, d, h) = size
+    west = x - w / 2
+    east = x + w / 2
+    south = y - d / 2
+    north = y + d / 2
     up = [0, 0, h]
     walls: list[tuple[ArrayLike, ArrayLike, ArrayLike]] = [
         ([west, south, low], [w, 0, 0], up),
@@ -91,7 +95,8 @@ def box(
 
 def solid(mesh: trimesh.Trimesh, surface: str, tint: Tint) -> Shape:
     """A closed mesh with smooth normals."""
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    vertices = np.array(mesh.vertices)
+    faces = np.array(mesh.faces)
     normals = np.array(mesh.vertex_normals)
     return Shape(vertices, normals, faces, surface, tint, np.ones(len(vertices)))
 
@@ -129,7 +134,8 @@ def pole(foot: Array, radius: float, height: float, surface: str, tint: Tint) ->
 
 def tree(foot: Array, height: float, rng: np.random.Generator) -> list[Shape]:
     """A trunk with a crown of three blobs, clear of the robot's head."""
-    radius, crown = height * rng.uniform(0.022, 0.034), height * rng.uniform(0.20, 0.30)
+    radius = height * rng.uniform(0.022, 0.034)
+    crown = height * rng.uniform(0.20, 0.30)
     shapes = [pole(foot, radius, height * 0.75, 'bark', BARK)]
     tint = choose(rng, GREENS)
     for _ in range(3):
@@ -166,8 +172,10 @@ def house(center: Array, size: Array, rng: np.random.Generator) -> list[Shape]:
 def _windows(center: Array, size: Array, side: int, rng: np.random.Generator) -> list[Shape]:
     """Framed panes on one wall, storey above storey; one of them is a door."""
     along = side % 2
-    length, out = size[along], (1 if side > 1 else -1)
-    count, pane = max(1, int(length / 2.2)), rng.uniform(0.8, 1.3)
+    length = size[along]
+    out = 1 if side > 1 else -1
+    count = max(1, int(length / 2.2))
+    pane = rng.uniform(0.8, 1.3)
     door = rng.integers(count)
     shapes = []
     for storey in range(int(size[2] // 2.4)):
@@ -199,7 +207,8 @@ def _gable(
 ) -> list[Shape]:
     """A roof with its ridge along the longer side, and the two gables under it."""
     long = 0 if size[0] >= size[1] else 1
-    ahead, aside = np.eye(3)[long] * size[long], np.eye(3)[1 - long] * size[1 - long]
+    ahead = np.eye(3)[long] * size[long]
+    aside = np.eye(3)[1 - long] * size[1 - long]
     rise = np.array([0, 0, rng.uniform(0.3, 0.5) * size[1 - long]])
     base = np.array([center[0], center[1], size[2]])
     tint = choose(rng, ROOFS)
@@ -229,8 +238,10 @@ class Plot:
 
     def beside(self, side: int, along: float, out: float) -> Array:
         """The point (2,) `out` meters outside the area on a side, `along` (-1..1) it."""
-        reach, width = self.half[side % 2], self.half[1 - side % 2]
-        x, y = reach + out, along * (width + max(out, 0))
+        reach = self.half[side % 2]
+        width = self.half[1 - side % 2]
+        x = reach + out
+        y = along * (width + max(out, 0))
         return np.array([[x, y], [-y, x], [-x, -y], [y, -x]][side])
 
     def extent(self, side: int, deep: float, wide: float) -> Array:
@@ -242,7 +253,8 @@ def lawn(plot: Plot) -> None:
     """The mown lawn with patches and stripes, and the fields beyond."""
     reach = plot.half + FENCE_M + 0.5
     ground = panel([*-reach, 0], [2 * reach[0], 0, 0], [0, 2 * reach[1], 0], 0.2, 'grass', GRASS)
-    x, y = ground.vertices[:, 0], ground.vertices[:, 1]
+    x = ground.vertices[:, 0]
+    y = ground.vertices[:, 1]
     heading = plot.rng.uniform(0, np.pi)
     stripes = np.sin((x * np.cos(heading) + y * np.sin(heading)) * 2 * np.pi / 1.6)
     patches = sum(
@@ -286,7 +298,8 @@ def bed(plot: Plot) -> None:
     """Bushes, flowers and garden things in the strip between lawn and fence."""
     spaces = 2 * plot.half.sum() * 2
     for _ in range(int(0.45 * spaces)):
-        side, along = int(plot.rng.integers(4)), plot.rng.uniform(-0.97, 0.97)
+        side = int(plot.rng.integers(4))
+        along = plot.rng.uniform(-0.97, 0.97)
         radius = plot.rng.uniform(0.18, 0.5)
         out = plot.rng.uniform(STRIP_M + 1.2 * radius, FENCE_M)
         center = np.array([*plot.beside(side, along, out), radius * 0.8])
@@ -294,7 +307,8 @@ def bed(plot: Plot) -> None:
         tint = choose(plot.rng, tints)
         plot.shapes.append(blob(center, radius * np.array([1, 1, 0.9]), tint, plot.rng, plant))
     for tint in ((0.55, 0.25, 0.08), (0.06, 0.25, 0.70), (0.10, 0.50, 0.62), (0.45, 0.45, 0.45)):
-        side, along = int(plot.rng.integers(4)), plot.rng.uniform(-0.9, 0.9)
+        side = int(plot.rng.integers(4))
+        along = plot.rng.uniform(-0.9, 0.9)
         foot = plot.beside(side, along, STRIP_M + 0.6)
         plot.shapes.append(pole(foot, 0.3, plot.rng.uniform(0.5, 1.0), 'plain', tint))
 
@@ -308,7 +322,8 @@ def buildings(plot: Plot) -> None:
     plot.shapes += _gable(shed, size, ('boards', WOODS[0]), plot.rng)
     for number, side in enumerate(sides[1:]):
         out = 6.5 if number == 0 else plot.rng.uniform(10, 18)
-        wide, deep = plot.rng.uniform(8, 12), plot.rng.uniform(6, 8)
+        wide = plot.rng.uniform(8, 12)
+        deep = plot.rng.uniform(6, 8)
         center = plot.beside(int(side), plot.rng.uniform(-0.6, 0.6), out)
         height = plot.rng.choice([3.0, 5.2])
         plot.shapes += house(center, np.array([*plot.extent(side, deep, wide), height]), plot.rng)
@@ -317,7 +332,8 @@ def buildings(plot: Plot) -> None:
 def trees(plot: Plot, dock: Array, on_lawn: int) -> None:
     """Trees behind the fence all around, and some on the lawn."""
     for number in range(14):
-        side, along = number % 4, plot.rng.uniform(-1.1, 1.1)
+        side = number % 4
+        along = plot.rng.uniform(-1.1, 1.1)
         foot = plot.beside(side, along, plot.rng.uniform(FENCE_M + 1.5, 9.0))
         kind = conifer if plot.rng.random() < 0.3 else tree
         plot.shapes += kind(foot, plot.rng.uniform(3.5, 7.5), plot.rng)
@@ -350,7 +366,8 @@ class Garden:
         config = config or SimulationConfig()
         if len(config.area) != 2 or min(config.area) < 6.0:
             raise ConfigError(f'area: {config.area} needs two sides of at least 6 m')
-        half, daylight = np.array(config.area) / 2, LIGHTS[config.light]
+        half = np.array(config.area) / 2
+        daylight = LIGHTS[config.light]
         plot = Plot(half, np.random.default_rng([seed, 0]))
         self.dock = np.array([plot.rng.uniform(-0.5, 0.5) * half[0], 0.3 - half[1], np.pi / 2])
         for part in (lawn, border, bed, buildings):

@@ -147,9 +147,11 @@ def raw_view(unproject: Callable[[Array], Array], size: tuple[int, int]) -> View
 def _rows_for(elevation: Array, config: PanoramaConfig) -> Array:
     """Falling elevations (R,) rad: fine in the panorama's band, coarse outside."""
     step = np.radians(config.elevation_max - config.elevation_min) / config.height / 2
-    top, bottom = np.radians(config.elevation_max), np.radians(config.elevation_min)
+    top = np.radians(config.elevation_max)
+    bottom = np.radians(config.elevation_min)
     fine = np.arange(top + 2.5 * step, bottom - 3 * step, -step)
-    highest, lowest = np.nanmax(elevation), max(np.nanmin(elevation), HULL_RAD)
+    highest = np.nanmax(elevation)
+    lowest = max(np.nanmin(elevation), HULL_RAD)
     above = np.arange(fine[0] + 2 * step, highest + 2 * step, 2 * step)[::-1]
     below = np.arange(fine[-1] - 4 * step, lowest - 4 * step, -4 * step)
     return np.concatenate([above, fine, below])
@@ -177,7 +179,8 @@ class Scene:
         daylight: Daylight | None = None,
     ) -> None:
         """Index the triangles of `shapes` and light them; `sun` (3,) points toward it."""
-        self.sun, self._daylight = sun, daylight or LIGHTS['day']
+        self.sun = sun
+        self._daylight = daylight or LIGHTS['day']
         self._atlas = Atlas.build(rng)
         self._sky = sky(rng, self._daylight.sky, sun)
         offsets = np.cumsum([0] + [len(shape.vertices) for shape in shapes])
@@ -255,10 +258,12 @@ class Scene:
         slant = np.abs(np.einsum('ij,ij->i', normal, rays.reshape(-1, 3)))
         slant /= np.sqrt(np.einsum('ij,ij->i', normal, normal)) + 1e-12
         footprint = hits['tfar'] * pixel_rad / np.sqrt(slant + 0.01)
-        u, v = values[:, 0].reshape(shape), values[:, 1].reshape(shape)
+        u = values[:, 0].reshape(shape)
+        v = values[:, 1].reshape(shape)
         texture = self._atlas.sample(u, v, rows[:, 15].reshape(shape), footprint.reshape(shape))
         hour = self._daylight
-        sun, ambient = np.array(hour.sun, np.float32), np.array(hour.ambient, np.float32)
+        sun = np.array(hour.sun, np.float32)
+        ambient = np.array(hour.ambient, np.float32)
         lit = values[:, 2:3] * (sun * light.sun) + values[:, 3:4] * ambient
         return np.asarray(texture * np.sqrt(np.maximum(lit * rows[:, 12:15], 0)).reshape(*shape, 3))
 
@@ -276,7 +281,8 @@ def metered(image: Floats, dome: Dome, target: float) -> Floats:
 
     Overexposed pixels count as white.
     """
-    config, degrees = PanoramaConfig(), np.degrees(dome.elevations_rad)
+    config = PanoramaConfig()
+    degrees = np.degrees(dome.elevations_rad)
     band = (degrees <= config.elevation_max) & (degrees >= config.elevation_min)
     seen = image[band if band.any() else slice(None)][:, ::METER_COLUMNS]
     gain = 1.0

@@ -111,7 +111,8 @@ class RouteBuilder:
             return
         self.turn_to(float(np.arctan2(offset[1], offset[0])), images)
         self.route.append(Motion(np.array([[distance, 0.0]]), images))
-        self.position, self.length_m = np.asarray(target, float), self.length_m + distance
+        self.position = np.asarray(target, float)
+        self.length_m = self.length_m + distance
 
     def reach(self, target: Array, rng: np.random.Generator, images: bool = False) -> None:
         """Drive to a point (2,) around the obstacles."""
@@ -138,7 +139,8 @@ class RouteBuilder:
         self.turn_to(float(at[0]))
         steps = np.stack([np.hypot(*chords.T), np.diff(at)], -1)
         self.route.append(Motion(steps))
-        self.position, self.heading = points[-1], float(at[-1])
+        self.position = points[-1]
+        self.heading = float(at[-1])
         self.length_m += float(steps[:, 0].sum())
 
 
@@ -146,7 +148,8 @@ def coverage(lawn: Lawn, start: Array, rng: np.random.Generator, length_m: float
     """Straight legs, `length_m` in all (0: by the lawn's size), over ground not yet passed and in
     directions not yet driven.
     """
-    builder, cells = RouteBuilder(lawn, start), Coverage(lawn)
+    builder = RouteBuilder(lawn, start)
+    cells = Coverage(lawn)
     driven = np.zeros(6)
     shortest = 0.8 * lawn.half.min()
     while builder.length_m < (length_m or 4.6 * lawn.half.prod()):
@@ -180,7 +183,8 @@ def lines(lawn: Lawn, start: Array, rng: np.random.Generator, length_m: float = 
 
     They are at least 8 m long, or 0.6 of the shorter side of a small lawn. `length_m` is unused.
     """
-    builder, cells = RouteBuilder(lawn, start), Coverage(lawn)
+    builder = RouteBuilder(lawn, start)
+    cells = Coverage(lawn)
     directions = rng.permutation(10) * np.pi / 10 + rng.uniform(0, np.pi)
     for direction in directions:
         start, end = _line(lawn, cells, direction, rng)
@@ -253,7 +257,8 @@ def closed_curve(
             continue
         error = abs(np.hypot(*np.diff(curve, axis=0).T).sum() / target - 1)
         if error < least:
-            best, least = curve, error
+            best = curve
+            least = error
         if least < 0.05:
             break
     if best is None:

@@ -23,8 +23,10 @@ Floats = NDArray[np.float32]
 TILE = 512
 PERIOD_M = 4.0
 LEVELS = 7
-SKY_ROWS, SKY_COLUMNS = 384, 2048
-SKY_LOWEST_DEG, SKY_HIGHEST_DEG = -6.0, 90.0
+SKY_ROWS = 384
+SKY_COLUMNS = 2048
+SKY_LOWEST_DEG = -6.0
+SKY_HIGHEST_DEG = 90.0
 
 
 def noise(
@@ -44,7 +46,9 @@ def noise(
 
 def _colored(brightness: Floats, hue: Floats | float = 0.0) -> Floats:
     """Stack to BGR; a positive `hue` makes it redder, a negative one bluer."""
-    blue, green, red = brightness - hue, brightness + 0 * hue, brightness + hue
+    blue = brightness - hue
+    green = brightness + 0 * hue
+    red = brightness + hue
     return np.stack(np.broadcast_arrays(blue, green, red), -1).astype(np.float32)
 
 
