@@ -472,7 +472,8 @@ TROUBLES = {
     ),
     'odometry: turns twice as far in the test': Trouble(
         lambda: counting(lambda way, turn: (way, 2.0 * turn)),
-        RIGHT_M, r'wheels: 0\.5\d times the turns counted, 1\.', trains=False,
+        # Until the turns of the first curve show it, the filter turns twice as far.
+        (0.055, 0.065), r'wheels: 0\.(49|5\d) times the turns counted, 1\.', trains=False,
     ),
     'odometry: half of the turns': Trouble(
         lambda: counting(lambda way, turn: (way, 0.5 * turn)),
