@@ -44,6 +44,9 @@ def generate_launch_description() -> LaunchDescription:
         ),
         DeclareLaunchArgument('odom', default_value='odom', description="odometry's topic"),
         DeclareLaunchArgument(
+            'imu', default_value='imu/data', description="the IMU's topic, for level_by_imu"
+        ),
+        DeclareLaunchArgument(
             'ekf', default_value='true', description='false: without ekf_node, poses of images only'
         ),
         DeclareLaunchArgument(
@@ -70,16 +73,18 @@ def _nodes(context: LaunchContext) -> list:
     launch itself would go on with every default.
     """
     given = context.launch_configurations
-    file = given['params_file'] or given['config']
-    if not Path(file).is_file():
-        raise FileNotFoundError(f'config:={file}: there is no such parameter file')
+    argument = 'params_file' if given['params_file'] else 'config'
+    file = Path(given[argument]).expanduser()
+    if not file.is_file():
+        raise FileNotFoundError(f'{argument}:={file}: there is no such parameter file')
     # Without the argument, the parameter file decides.
-    start = {'autostart': given['autostart'] == 'true'} if given['autostart'] else {}
+    start = {'autostart': _is_true(given['autostart'])} if given['autostart'] else {}
     node = partial(_node, file, start)
     transport = {'image_transport': given['image_transport']}
     model = {'model': given['model']}
     image, panorama = given['image'], given['panorama']
     images = [('image_raw', image), ('image_raw/compressed', f'{image}/compressed')]
+    images.append(('imu/data', given['imu']))
     # As Nav2 does, so that robots with frames of the same names do not meet on /tf.
     odometry = [('odom', given['odom']), ('/tf', given['tf'])]
     if panorama:
@@ -88,6 +93,14 @@ def _nodes(context: LaunchContext) -> list:
         seeing = [node('omnicam_node', images, {**model, **transport}), node('sfa_node', [], model)]
     ekf = node('ekf_node', odometry, {}, condition=IfCondition(given['ekf']))
     return [PushROSNamespace(given['namespace']), *seeing, ekf, _rviz(given)]
+
+
+def _is_true(text: str) -> bool:
+    """A boolean as ROS and Python write it. Raises ValueError for anything else."""
+    values = {'true': True, '1': True, 'false': False, '0': False}
+    if text.lower() not in values:
+        raise ValueError(f'autostart:={text}: give true or false')
+    return values[text.lower()]
 
 
 def _rviz(given: dict) -> Node:
@@ -102,7 +115,7 @@ def _rviz(given: dict) -> Node:
 
 
 def _node(
-    file: str, start: dict, name: str, remappings: list, parameters: dict, **options: object
+    file: Path, start: dict, name: str, remappings: list, parameters: dict, **options: object
 ) -> Node:
     sim_time = ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
     return Node(

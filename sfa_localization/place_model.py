@@ -173,7 +173,7 @@ class PlaceModel:
     @classmethod
     def load(cls, path: Path | str) -> PlaceModel:
         """Read a model. Raises ModelError when it is missing, damaged or of another version."""
-        path = Path(path)
+        path = Path(path).expanduser()
         arrays = read_arrays(path, FORMAT, VERSION, _REMEDY)
         try:
             model = cls._from_arrays(arrays, json.loads(str(arrays['header'])))
@@ -255,11 +255,12 @@ class PlaceModel:
 
 def camera_of(path: Path | str) -> tuple[PanoramaConfig, LensCalibration | None]:
     """Panorama and lens of a model, without reading the rest. Raises ModelError."""
-    header = read_header(Path(path), FORMAT, VERSION, _REMEDY)
+    path = Path(path).expanduser()
+    header = read_header(path, FORMAT, VERSION, _REMEDY)
     try:
         return PanoramaConfig.from_mapping(header['panorama'], 'panorama'), lens_from(header)
     except (ConfigError, KeyError, TypeError) as error:
-        raise _damaged(Path(path), str(error)) from None
+        raise _damaged(path, str(error)) from None
 
 
 def lens_from(header: Mapping[str, Any]) -> LensCalibration | None:

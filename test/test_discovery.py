@@ -12,10 +12,10 @@ pytest.importorskip('rclpy')
 
 from nav_msgs.msg import Odometry
 from ros_bench import standing, until
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import CompressedImage, Image, Imu
 
-from sfa_localization.nodes import discovery
-from sfa_localization.nodes.conversions import to_image
+from sfa_localization.nodes import discovery, lifecycle
+from sfa_localization.nodes.conversions import to_compressed, to_image
 from sfa_localization.nodes.ekf_node import EkfNode
 from sfa_localization.nodes.omnicam_node import OmnicamNode
 from sfa_localization.nodes.sfa_node import SfaNode
@@ -27,6 +27,43 @@ STAMP_NS = 10**9
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch):
     monkeypatch.setattr(discovery, 'PATIENCE_S', 0.0)
+
+
+@pytest.mark.parametrize(('topic', 'given'), [
+    ('/cam/image_raw', ''), ('/mine', '/mine'), ('/mine', '/mine/compressed'),
+])  # fmt: skip
+def test_images_of_another_transport_are_taken(bench, topic, given):
+    """Many cameras publish compressed images only."""
+    words = ['--ros-args', '-r', f'image_raw:={given}'] if given else []
+    node = bench.run(OmnicamNode, options={'cli_args': words})
+    heard = bench.listen(Image, 'panorama')
+    message = to_compressed(np.full((60, 600, 3), 90, np.uint8), STAMP_NS, 'camera', 90)
+    assert bench.publish_until(f'{topic}/compressed', message, lambda: heard)
+    assert node.full_name('image_raw') == f'{topic}/compressed'
+
+
+def test_depth_is_no_image(bench):
+    node = bench.run(OmnicamNode)
+    announce(bench, node, CompressedImage, '/cam/depth/compressedDepth')
+    assert not takes_another(node, 'image_raw')
+
+
+def test_the_only_imu_is_taken(bench):
+    node = bench.run(OmnicamNode, level_by_imu=True)
+    announce(bench, node, Imu, '/imu')
+    assert until(lambda: node.full_name('imu/data') == '/imu')
+
+
+def test_another_node_that_publishes_the_same_is_named(bench, monkeypatch):
+    monkeypatch.setattr(lifecycle, 'TWIN_S', 0.0)
+    first = bench.run(EkfNode)
+    assert first.twin == ''
+    second = bench.run(EkfNode)
+    for node in (first, second):
+        assert until(lambda n=node: 'another node of this name publishes on' in n.twin)
+        assert node.twin in node.status().reasons and node.twin in node.health()[1]
+    bench.end(second)
+    assert until(lambda: first.twin == '')
 
 
 def announce(bench, node, kind, *names):

@@ -228,8 +228,9 @@ def test_robot_localization_finds_a_robot_that_starts_anywhere(launch):
     distant = np.array([200.0, -200.0, math.pi])
     d2 = distant @ np.linalg.solve(covariance[np.ix_(used, used)], distant)
     assert d2 <= settings['pose0_rejection_threshold'] ** 2
-    (line,) = re.findall('^ros2 launch (.*)$', PAGES['config/robot_localization.md'], re.M)
-    assert [*launch(**given(line))] == ['omnicam_node', 'sfa_node'], 'no second filter'
+    before, alone = re.findall('^ros2 launch (.*)$', PAGES['config/robot_localization.md'], re.M)
+    assert dict(launch(**given(before))['ekf_node']['remappings'])['odom'] == '/odometry/filtered'
+    assert [*launch(**given(alone))] == ['omnicam_node', 'sfa_node'], 'no second filter'
 
 
 _COSTMAP = ('global_frame', 'robot_base_frame', 'rolling_window', 'width', 'height', 'resolution',
@@ -347,6 +348,10 @@ def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
     for node in launch(autostart='false', params_file=ROOT / 'config/nav2.yaml').values():
         file, chosen = node['parameters']
         assert file == ROOT / 'config/nav2.yaml' and chosen['autostart'] is False
+    assert launch(autostart='True')['ekf_node']['parameters'][1]['autostart'] is True
+    with pytest.raises(ValueError, match='autostart:=on: give true or false'):
+        launch(autostart='on')
+    assert ('imu/data', '/imu') in launch(imu='/imu')['omnicam_node']['remappings']
     assert without['sfa_node']['parameters'][1]['image_transport'] == 'compressed'
     panorama = dict(without['sfa_node']['remappings'])['panorama']
     odometry = dict(without['ekf_node']['remappings'])['odom']
@@ -354,6 +359,8 @@ def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
         assert {f'{panorama}/compressed', f'/{odometry}'} <= set(bag.topics)
     with pytest.raises(FileNotFoundError, match=r'config:=/nowhere\.yaml'):
         launch(config='/nowhere.yaml')  # launch_ros itself only warns, and starts with defaults
+    with pytest.raises(FileNotFoundError, match=r'params_file:=/nowhere\.yaml'):
+        launch(params_file='/nowhere.yaml')
 
 
 def test_a_launch_ends_with_what_cannot_start_and_starts_again_what_dies(launch, launch_file):

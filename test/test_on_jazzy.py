@@ -223,7 +223,8 @@ def test_the_replay_of_the_readme_becomes_localised(bench, start, model):
 
 
 @pytest.mark.parametrize(('argument', 'reasons'), [
-    ('config:=/none.yaml', ['there is no such parameter file']),
+    ('config:=/none.yaml', ['config:=/none.yaml: there is no such parameter file']),
+    ('params_file:=/none.yaml', ['params_file:=/none.yaml: there is no such parameter file']),
     ('image_transport:=raw', ['none.npz: no such file', 'cannot start']),
 ])  # fmt: skip
 def test_a_launch_without_its_parameter_file_or_model_ends_with_1(start, argument, reasons):
@@ -234,7 +235,7 @@ def test_a_launch_without_its_parameter_file_or_model_ends_with_1(start, argumen
 
 @pytest.mark.parametrize('respawn', ['true', 'false'])
 def test_a_node_that_dies_is_started_again_unless_asked(bench, start, model, respawn):
-    chain = launch(start, f'model:={model}', f'respawn:={respawn}')
+    chain = launch(start, f'model:={model}', f'respawn:={respawn}', 'autostart:=True')
     heard = states(bench)
 
     def printed(text):

@@ -14,16 +14,23 @@ from sfa_localization.nodes.process import NODES
 PATIENCE_S = 3.0
 """Time before another topic is taken: drivers of cameras and wheels may start after this node."""
 _TRANSPORT = re.compile('/(compressed|ffmpeg|foxglove)$')
+_DEPTH = '/compressedDepth'
 _OUTPUTS = '/ekf/odometry', '/panorama', '/panorama/compressed'
 """Odometry and images of this package's nodes, which a bag may hold: never an input."""
+
+
+def without_transport(topic: str) -> str:
+    """The name of an image topic without that of its transport, as image_transport names it."""
+    return _TRANSPORT.sub('', topic)
 
 
 class Discovery:
     """Looks for topics of `types`, of which the first is that of the input `topic`.
 
     `arguments` of the launch file choose another topic: the first is the input's. `take` is called
-    with the only topic that qualifies, unless the input was remapped, and with the input's own
-    topic when somebody publishes on that again.
+    with the only topic of the first type that qualifies, or else of any, and with this type, unless
+    the input was remapped to a topic that is published; and with the input's own topic when
+    somebody publishes on that again.
     """
 
     def __init__(
@@ -32,7 +39,7 @@ class Discovery:
         topic: str,
         types: Sequence[str],
         arguments: Sequence[str],
-        take: Callable[[str], None] | None = None,
+        take: Callable[[str, str], None] | None = None,
     ) -> None:
         self._node = node
         self._topic = topic
@@ -40,7 +47,7 @@ class Discovery:
         self._types = types
         self._start_s = steady_s()
         self._expected = node.resolve_topic_name(topic)
-        self._take = None if node.is_remapped(topic) else take
+        self._take = take
         self._has_substitute = False
         self.hint = ''
         """Which topics there are, while nobody publishes on that of the input."""
@@ -49,10 +56,11 @@ class Discovery:
     def look(self) -> None:
         """Take a topic, or update `hint` and log it."""
         early = steady_s() < self._start_s + PATIENCE_S
-        published = self._node.count_publishers(self._expected)
+        infos = self._node.get_publishers_info_by_topic(self._expected)
+        published = any(info.topic_type == self._types[0] for info in infos)
         if self._has_substitute and published and self._take is not None:
             self._has_substitute = False
-            self._take(self._expected)
+            self._take(self._expected, self._types[0])
         elif early or published or self._node.monitors[self._topic].received:
             self.hint = ''
         elif not self._has_substitute:
@@ -68,16 +76,11 @@ class Discovery:
             # Panoramas are an input where an argument of the launch file takes them.
             if 'panorama' in self._arguments or not self._is_output(name)
         ]
-        usable = [n for n, kind in topics if kind == self._types[0] and self._qualifies(n)]
-        if self._take is not None and len(usable) == 1:
-            self._has_substitute = True
-            self.hint = ''
-            self._node.get_logger().warning(
-                f'nobody publishes on {self._expected}: taking {usable[0]}, the only '
-                f'{self._types[0]}; {self._arguments[0]}:={_TRANSPORT.sub("", usable[0])} '
-                'makes this permanent'
-            )
-            self._take(usable[0])
+        usable = [(name, kind) for name, kind in topics if self._qualifies(name)]
+        of_input = [(name, kind) for name, kind in usable if kind == self._types[0]]
+        candidates = of_input or usable
+        if self._take is not None and len(candidates) == 1:
+            self._substitute(*candidates[0])
             return
         listed = ', '.join(f'{name} ({kind})' for name, kind in topics)
         choices = ' or '.join(f'{argument}:=NAME' for argument in self._arguments)
@@ -87,13 +90,33 @@ class Discovery:
         if self.hint not in ('', before):
             self._node.get_logger().warning(self.hint)
 
+    def _substitute(self, name: str, kind: str) -> None:
+        """Take a topic in place of the input's own."""
+        assert self._take is not None
+        self._has_substitute = True
+        self.hint = ''
+        base = without_transport(name)
+        given = f'{self._arguments[0]}:={base}'
+        if kind != self._types[0]:
+            given += f' image_transport:={name.removeprefix(base).strip("/") or "raw"}'
+        self._node.get_logger().warning(
+            f'nobody publishes on {self._expected}: taking {name}, the only {kind}; {given} makes '
+            'this permanent'
+        )
+        self._take(name, kind)
+
     def _qualifies(self, name: str) -> bool:
-        """Whether a topic is no output of this package, and in no other robot's namespace."""
+        """Whether a topic is no output of this package, and in no other robot's namespace. An input
+        that is remapped takes the same images by another transport only.
+        """
+        if self._node.is_remapped(self._topic):
+            return without_transport(name) == without_transport(self._expected)
         below = self._node.get_namespace().rstrip('/') + '/'
         spaces = {f'{space}/' for _, space in self._node.get_node_names_and_namespaces()}
         others = tuple(space for space in spaces if len(space) > len(below))
         usual = name.startswith(below) and not name.startswith(others)
-        return usual and not self._is_output(name)
+        is_image = not name.endswith(_DEPTH)
+        return usual and is_image and not self._is_output(name)
 
     def _is_output(self, name: str) -> bool:
         ours = {node for node, _ in self._publishers(name)} & {*NODES, self._node.get_name()}

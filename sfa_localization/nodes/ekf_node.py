@@ -152,7 +152,7 @@ class EkfNode(LocalizationNode):
 
     # Inputs.
 
-    def _subscribe_odometry(self, substitute: str = '') -> None:
+    def _subscribe_odometry(self, substitute: str = '', _: str = '') -> None:
         self.unsubscribe(self._odometry_input)
         receive = self._receive_odometry
         qos = sensor_qos(100)
@@ -341,6 +341,7 @@ class EkfNode(LocalizationNode):
         if self.filter.odometry_in_turn and self.count_publishers(name) > 1:
             reasons.append(f'two publishers on {name}: stop one, or take another topic by odom:=')
             self.get_logger().warning(reasons[-1], throttle_duration_sec=_LOG_S)
+        reasons += [self.twin] if self.twin else []
         if self._paused:
             reasons.append('paused: images are not fused')
         lost = []

@@ -36,17 +36,26 @@ class ImageInput:
         self._node = node
         self._topic = topic
         self._use = use
+        self._transport = transport
         self._kind = _message_class(transport)
         self.types = sorted(TRANSPORTS.values(), key=lambda kind: kind != TRANSPORTS[transport])
         """Types of image messages, this input's first."""
-        self._holds_video = transport in ('ffmpeg', 'foxglove')
+        self._holds_video = False
         self._subscription: Any = None
-        self._substitute = ''
+        self._substitute = '', ''
 
-    def start(self, substitute: str = '') -> None:
-        """Subscribe to the topic, or to a substitute for it."""
+    def start(self, substitute: str = '', kind: str = '') -> None:
+        """Subscribe to the topic, or to a substitute for it, of another kind of message. Raises
+        ConfigError where such messages are not installed.
+        """
+        transports = {each: name for name, each in TRANSPORTS.items()}
+        transport = transports.get(kind, self._transport)
+        if self._substitute != (substitute, kind):
+            self._kind = _message_class(transport)
+            self._holds_video = False
         self._reader = ImageReader(self._kind.__name__)
-        self._substitute = substitute
+        self._substitute = substitute, kind
+        self._holds_video |= transport in ('ffmpeg', 'foxglove')
         depth, entity = (_PACKETS, 'video') if self._holds_video else (1, None)
         self._subscription = self._node.subscribe(
             self._kind, self._topic, self._receive, sensor_qos(depth), substitute, entity
@@ -65,7 +74,7 @@ class ImageInput:
         if self._reader.is_video and not self._holds_video:
             self._holds_video = True
             self.stop()
-            self.start(self._substitute)
+            self.start(*self._substitute)
         problem: LocalizationError | None = None
         for image_ns, image in images:
             try:

@@ -40,6 +40,10 @@ from sfa_localization.nodes.settings import NodeConfig
 _PACKAGE = 'sfa_localization'
 DIAGNOSTICS_PERIOD_S = 1.0
 """Time between messages on /diagnostics: diagnostic_aggregator expects about one a second."""
+SHARED = '/tf', '/diagnostics'
+"""Topics on which many nodes publish."""
+TWIN_S = 30.0
+"""Longer than DDS takes to forget a node that was killed."""
 _WAKE_PERIOD_S = 0.5  # a signal just before the executor waits does not always wake it
 S = TypeVar('S', bound=Settings)
 _SUCCESS = TransitionCallbackReturn.SUCCESS
@@ -69,7 +73,11 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self.monitors: defaultdict[str, Monitor] = defaultdict(Monitor)
         self._full_names: dict[str, str] = {}
         self._entities: dict[Any, Callable[[Any], Any]] = {}
+        self._outputs: list[Any] = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._alone_s = steady_s()
+        self.twin = ''
+        """Which other node publishes what this one does, in words."""
         self._settings = parameters.declare(self, [NodeConfig, *kinds])
         parameters.on_change(self, self._settings, self.check, self.settings_changed)
 
@@ -121,6 +129,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             kind, topic, qos, qos_overriding_options=overrides
         )
         self._entities[publisher] = self.destroy_lifecycle_publisher
+        self._outputs += [] if topic in SHARED else [publisher]
         return publisher
 
     def subscribe(
@@ -301,13 +310,36 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self.attempt('cleanup', self.teardown)
         for entity, destroy in reversed(self._entities.items()):
             destroy(entity)
-        for held in (self._entities, self.monitors, self._full_names):
+        for held in (self._entities, self._outputs, self.monitors, self._full_names):
             held.clear()
+
+    def _find_twin(self) -> None:
+        """Note who else publishes on the outputs: a forgotten launch, or a bag that holds them."""
+        now_s = steady_s()
+        name = self.get_fully_qualified_name()
+        others = []
+        for output in self._outputs:
+            infos = self.get_publishers_info_by_topic(output.topic_name)
+            names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in infos]
+            if name in names:
+                names.remove(name)
+            others += [(other, output.topic_name) for other in names]
+        self._alone_s = self._alone_s if others else now_s
+        self.twin = ''
+        if now_s > self._alone_s + TWIN_S:
+            other, topic = others[0]
+            this = 'another node of this name' if other == name else other
+            self.twin = f'{this} publishes on {topic} too: end one of both'
+            self.get_logger().warning(self.twin, once=True)
 
     def _publish_health(self) -> None:
         if not self.active:
             return
+        self._find_twin()
         level, text, values = self.health()
+        if self.twin:
+            level = max(level, DiagnosticStatus.WARN)
+            text = f'{self.twin}; {text}'
         stamp = self.get_clock().now()
         is_simulated = self.get_parameter('use_sim_time').value
         patient = steady_s() < self._configured_s + PATIENCE_S

@@ -35,7 +35,7 @@ from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes import lifecycle
-from sfa_localization.nodes.discovery import Discovery
+from sfa_localization.nodes.discovery import Discovery, without_transport
 from sfa_localization.nodes.image_input import ImageInput
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.parameters import Current
@@ -77,6 +77,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._lens: LensCalibration | None = None
         self._trained: PanoramaConfig | None = None
         self._rim: RimWatch | None = None
+        self._imu: Any = None
         self._unwrapper = self._new_unwrapper(self._settings)
         self._newest: deque[tuple[int, Image]] = deque(maxlen=1)
         self._tilts: deque[tuple[int, float, float]] = deque(maxlen=_ORIENTATIONS)
@@ -98,7 +99,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         raw = transport == 'raw'
         self._input = 'image_raw' if raw else self.following(f'image_raw/{transport}')
         self.discovery: Discovery | None = None
-        self._substitute = ''
+        self._substitute = '', ''
         capture = self.settings(CaptureConfig)
         if capture.source == 'topic':
             self.require_input(self._input)
@@ -111,7 +112,9 @@ class OmnicamNode(lifecycle.LocalizationNode):
             self._arrival = self.create_guard_condition(self._arrived)
             self._feed = Feed(opener(capture), self._deliver, capture, self._reject, self._wanted)
         if self.settings(CameraConfig).level_by_imu:
-            self.subscribe(Imu, _IMU, self._take_orientation, lifecycle.sensor_qos(20))
+            self._listen_to_imu()
+            types = ['sensor_msgs/msg/Imu']
+            self._imus = Discovery(self, _IMU, types, ['imu'], self._listen_to_imu)
         self.every(_DEMAND_PERIOD_S, self._follow_demand)
 
     def _use(self, model: str) -> None:
@@ -159,7 +162,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
             self._stop_listening()
         elif self._listening_since_s is None and self._images is not None:
             self._listening_since_s = steady_s()
-            self._images.start(self._substitute)
+            self._images.start(*self._substitute)
             if self._lens is None and not self.settings(CameraConfig).is_described:
                 take = self._take_calibration
                 qos = lifecycle.sensor_qos(1)
@@ -171,7 +174,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         """The topic beside that of the images, as image_transport names it, unless remapped."""
         if self.is_remapped(_CAMERA_INFO):
             return _CAMERA_INFO
-        images = self.full_name(self._input).removesuffix(f'/{self._config.image_transport}')
+        images = without_transport(self.full_name(self._input))
         return f'{images.rpartition("/")[0]}/{_CAMERA_INFO}'
 
     def _take_calibration(self, message: CameraInfo) -> None:
@@ -194,11 +197,11 @@ class OmnicamNode(lifecycle.LocalizationNode):
             problem = status.problem
             self._reject(f'lost: {problem}' if self._size else f'cannot open: {problem}')
 
-    def _take(self, topic: str) -> None:
+    def _take(self, topic: str, kind: str) -> None:
         """Take images from a substitute for the input's topic, or again from that itself."""
         self._stop_listening()
         self.require_input(self._input, topic)
-        self._substitute = topic
+        self._substitute = topic, kind
 
     def _stop_listening(self) -> None:
         if self._images is not None:
@@ -223,6 +226,11 @@ class OmnicamNode(lifecycle.LocalizationNode):
         if stamp_ns <= 0:
             raise MessageError('the clock has not started')
         self._publish(stamp_ns, image, '')
+
+    def _listen_to_imu(self, substitute: str = '', _: str = '') -> None:
+        self.unsubscribe(self._imu)
+        qos = lifecycle.sensor_qos(20)
+        self._imu = self.subscribe(Imu, _IMU, self._take_orientation, qos, substitute)
 
     def _take_orientation(self, message: Imu) -> None:
         stamp_ns = read_stamp(message.header.stamp)
@@ -318,5 +326,6 @@ class OmnicamNode(lifecycle.LocalizationNode):
             return _WARN, self._rim.problem
         if not self._is_level:
             topic = self.full_name(_IMU)
-            return _WARN, f'no orientation on {topic} near images: panoramas are not leveled'
+            missing = f'no orientation on {topic} near images: panoramas are not leveled'
+            return _WARN, '; '.join(filter(None, (missing, self._imus.hint)))
         return _OK, ''
