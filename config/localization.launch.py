@@ -17,7 +17,7 @@ from launch_ros.actions import Node, PushROSNamespace
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-from sfa_localization.nodes.process import CANNOT_START
+from sfa_localization.nodes.process import CANNOT_START, COMPOSED
 
 PACKAGE = 'sfa_localization'
 RESPAWN_DELAY_S = 2.0
@@ -58,6 +58,9 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             'autostart', default_value='', description='false: a lifecycle manager starts the nodes'
         ),
+        DeclareLaunchArgument(
+            'composed', default_value='false', description='true: all nodes in one process'
+        ),
         DeclareLaunchArgument('log_level', default_value='info', description='of the nodes'),
         DeclareLaunchArgument('rviz', default_value='false', description='start RViz too'),
         DeclareLaunchArgument(
@@ -78,7 +81,7 @@ def _nodes(context: LaunchContext) -> list:
     if not file.is_file():
         raise FileNotFoundError(f'{argument}:={file}: there is no such parameter file')
     # Without the argument, the parameter file decides.
-    start = {'autostart': _is_true(given['autostart'])} if given['autostart'] else {}
+    start = {'autostart': _is_true(given, 'autostart')} if given['autostart'] else {}
     node = partial(_node, file, start)
     transport = {'image_transport': given['image_transport']}
     model = {'model': given['model']}
@@ -87,6 +90,11 @@ def _nodes(context: LaunchContext) -> list:
     images.append(('imu/data', given['imu']))
     # As Nav2 does, so that robots with frames of the same names do not meet on /tf.
     odometry = [('odom', given['odom']), ('/tf', given['tf'])]
+    if _is_true(given, 'composed'):
+        if panorama or given['ekf'] != 'true':
+            raise ValueError('composed:=true runs all nodes: leave panorama:= and ekf:= out')
+        chain = node('localization', images + odometry, {**model, **transport})
+        return [PushROSNamespace(given['namespace']), chain, _rviz(given)]
     if panorama:
         seeing = [node('sfa_node', [('panorama', panorama)], {**model, **transport})]
     else:
@@ -95,11 +103,12 @@ def _nodes(context: LaunchContext) -> list:
     return [PushROSNamespace(given['namespace']), *seeing, ekf, _rviz(given)]
 
 
-def _is_true(text: str) -> bool:
-    """A boolean as ROS and Python write it. Raises ValueError for anything else."""
+def _is_true(given: dict, argument: str) -> bool:
+    """An argument as ROS and Python write booleans. Raises ValueError for anything else."""
     values = {'true': True, '1': True, 'false': False, '0': False}
+    text = given[argument]
     if text.lower() not in values:
-        raise ValueError(f'autostart:={text}: give true or false')
+        raise ValueError(f'{argument}:={text}: give true or false')
     return values[text.lower()]
 
 
@@ -121,7 +130,8 @@ def _node(
     return Node(
         package=PACKAGE,
         executable=name,
-        name=name,
+        # All nodes of one process would have one name.
+        **({} if name == COMPOSED else {'name': name}),
         output='screen',
         arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')],
         parameters=[file, {'use_sim_time': sim_time, **start, **parameters}],

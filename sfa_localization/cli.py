@@ -16,7 +16,7 @@ from pathlib import Path
 from sfa_localization import __version__
 from sfa_localization.data.errors import LocalizationError, NodeError
 from sfa_localization.nodes import entry
-from sfa_localization.nodes.process import NODES
+from sfa_localization.nodes.process import EXECUTABLES
 
 COMMANDS = {
     'simulate': 'Record a bag with a simulated robot in a simulated garden.',
@@ -51,10 +51,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     _prepare_streams()
     if argv is None:
         called = Path(sys.argv[0]).stem
-        argv = [called] * (called in {*COMMANDS, *NODES}) + sys.argv[1:]
+        argv = [called] * (called in {*COMMANDS, *EXECUTABLES}) + sys.argv[1:]
     words = list(argv)
     name = words[0] if words else ''
-    for number in (signal.SIGTERM, signal.SIGHUP) if name not in NODES else ():
+    for number in (signal.SIGTERM, signal.SIGHUP) if name not in EXECUTABLES else ():
         if signal.getsignal(number) != signal.SIG_IGN:  # as after nohup
             signal.signal(number, signal.default_int_handler)  # like Ctrl-C, to clean up
     return guarded(lambda: _run(name, words))
@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(name: str, words: Sequence[str]) -> int:
     """Run a node, which parses its ROS arguments itself, or a command; return the exit code."""
-    if name in NODES:
+    if name in EXECUTABLES:
         return entry.run(name, words)
     if name not in COMMANDS:
         _overview().parse_args(words)  # prints help, version or error, and exits
@@ -114,7 +114,7 @@ def _overview() -> argparse.ArgumentParser:
     )
     parser.add_argument('--version', action='version', version=__version__)
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
-    for name, summary in {**COMMANDS, **NODES}.items():
+    for name, summary in {**COMMANDS, **EXECUTABLES}.items():
         commands.add_parser(name, help=summary)
     return parser
 

@@ -63,7 +63,7 @@ def start_process(*words, **options):
 
 
 def end_node(node):
-    """End a node as `run_node` does."""
+    """End a node as `run_nodes` does."""
     node.teardown()
     node.destroy_node()
 

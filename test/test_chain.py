@@ -26,6 +26,7 @@ from std_msgs.msg import String
 
 from sfa_localization.data.messages import read_planar, read_stamp
 from sfa_localization.nodes import ekf_node
+from sfa_localization.nodes.composition import chain
 from sfa_localization.nodes.conversions import to_image
 from sfa_localization.nodes.ekf_node import EkfNode
 from sfa_localization.nodes.omnicam_node import OmnicamNode
@@ -180,3 +181,44 @@ def test_live_nodes_localizer_and_evaluate_give_the_same_poses(bench, tmp_path):
     same(moved(seen, to_truth), judged.estimates['sfa'])
     same(moved(fused, to_truth), judged.estimates['ekf'])
     assert judged.scores['ekf']['p95'] < 0.3
+
+
+def published(bench, recording, space, nodes):
+    """Return what nodes of a namespace publish from the images of a camera."""
+    omnicam, sfa, ekf = nodes
+    seen = bench.listen(PoseStamped, f'{space}/sfa/pose')
+    fused = bench.listen(Odometry, f'{space}/ekf/odometry')
+    assert until(lambda: ekf.monitors['sfa/rig'].used == 1)
+    inputs = [omnicam.monitors['image_raw'], sfa.monitors['panorama'], ekf.monitors[SEEN]]
+    for stamp_ns, kind, index in recording.events():
+        monitors = inputs
+        if kind == ODOMETRY:
+            monitors = [ekf.monitors['odom']]
+            topic, message = message_of(recording.drive, 0, recording.kept[index])
+        else:
+            topic, message = 'image_raw', to_image(recording.pictures[index], stamp_ns, 'omnicam')
+        counts = [monitor.received + 1 for monitor in monitors]
+        bench.publish(f'{space}/{topic}', message)
+        assert until(lambda m=monitors, c=counts: [one.received for one in m] == c)
+    last = int(recording.drive.stamps_ns[-1])
+    assert until(lambda: fused and read_stamp(fused[-1].header.stamp) == last)
+    return trajectory(seen), trajectory(fused)
+
+
+def test_nodes_of_one_process_publish_the_same_and_hand_panoramas_over(bench, tmp_path):
+    (tmp_path / 'own.yaml').write_text(PARAMETERS)
+    words = ['--ros-args', '--params-file', str(tmp_path / 'own.yaml')]
+    recording, results = Recording(), []
+    for space in ('/apart', '/together'):
+        options = {'namespace': space, 'cli_args': words}
+        kinds = [OmnicamNode, SfaNode, EkfNode]
+        if space == '/together':
+            made = chain(context=bench.context, **options)
+            kinds = [lambda node=node, **_: node for node in made]
+        nodes = [bench.run(kind, options=options) for kind in kinds]
+        results.append(published(bench, recording, space, nodes))
+        count = bench.node.count_subscribers(f'{space}/panorama')
+        assert count == (space == '/apart'), 'no message of a panorama is made'
+    for apart, together in zip(*results, strict=True):
+        assert np.array_equal(apart.stamps_ns, together.stamps_ns)
+        assert np.array_equal(apart.poses, together.poses)

@@ -359,6 +359,11 @@ def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
         assert {f'{panorama}/compressed', f'/{odometry}'} <= set(bag.topics)
     with pytest.raises(FileNotFoundError, match=r'config:=/nowhere\.yaml'):
         launch(config='/nowhere.yaml')  # launch_ros itself only warns, and starts with defaults
+    (composed,) = launch(composed='true', odom='wheels', autostart='false').values()
+    assert composed['executable'] == 'localization' and 'name' not in composed
+    assert {'image_raw', 'odom', '/tf', 'imu/data'} <= {name for name, _ in composed['remappings']}
+    with pytest.raises(ValueError, match='leave panorama:= and ekf:= out'):
+        launch(composed='true', ekf='false')
     with pytest.raises(FileNotFoundError, match=r'params_file:=/nowhere\.yaml'):
         launch(params_file='/nowhere.yaml')
 

@@ -160,6 +160,11 @@ def test_a_node_that_dies_later_has_another_exit_code_than_one_that_cannot_start
     assert code == DIED and 'ZeroDivisionError' in text
 
 
+def test_all_nodes_run_in_one_process_or_none(bench, start, tmp_path):
+    code, text = ended(start('localization', '-p', f'model:={tmp_path}/none.npz'))
+    assert code == CANNOT_START and 'none.npz: no such file' in text
+
+
 def test_misspelt_sections_and_parameters_are_warned_of(start, tmp_path):
     """Parameters of other nodes are not: ROS gives a section `/**` to all."""
     path = tmp_path / 'parameters.yaml'

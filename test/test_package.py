@@ -16,7 +16,8 @@ import setuptools
 
 import sfa_localization
 from sfa_localization import cli
-from sfa_localization.cli import COMMANDS, NODES
+from sfa_localization.cli import COMMANDS, EXECUTABLES
+from sfa_localization.nodes.process import NODES
 
 NAME = 'sfa_localization'
 ROOT = Path(__file__).parents[1]
@@ -215,7 +216,7 @@ def test_pip_installs_a_command_and_the_nodes_and_colcon_all_commands():
         executables = {Path(name).name for name in arguments.get('scripts', ())}
         executables |= {line.split(' = ')[0] for line in lines}
         commands = set(COMMANDS) if command in ('install', 'develop') else set()
-        assert executables == {NAME, *NODES, *commands}
+        assert executables == {NAME, *EXECUTABLES, *commands}
         assert not [name for name in arguments['packages'] if 'test' in name or 'study' in name]
 
 

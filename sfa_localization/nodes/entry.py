@@ -16,7 +16,7 @@ import textwrap
 from collections.abc import Sequence
 from functools import partial
 
-from sfa_localization.nodes.process import NODES, SIGNALS
+from sfa_localization.nodes.process import COMPOSED, EXECUTABLES, NODES, SIGNALS
 
 
 def run(name: str, words: Sequence[str] | None = None) -> int:
@@ -27,23 +27,30 @@ def run(name: str, words: Sequence[str] | None = None) -> int:
         return 0
     for number in SIGNALS:  # until ROS handles them there is nothing to clean up
         signal.signal(number, lambda *_: os._exit(0))
-    module = importlib.import_module(f'sfa_localization.nodes.{name}')
     lifecycle = importlib.import_module('sfa_localization.nodes.lifecycle')
-    return int(lifecycle.run_node(getattr(module, name.title().replace('_', '')), words))
+    if name == COMPOSED:
+        composition = importlib.import_module('sfa_localization.nodes.composition')
+        return int(lifecycle.run_nodes(composition.chain, words))
+    module = importlib.import_module(f'sfa_localization.nodes.{name}')
+    kind = getattr(module, name.title().replace('_', ''))
+    return int(lifecycle.run_nodes(lambda: [kind()], words))
 
 
-omnicam_node, sfa_node, ekf_node = (partial(run, name) for name in NODES)
+omnicam_node, sfa_node, ekf_node, localization = (partial(run, name) for name in EXECUTABLES)
 
 
 def node_help(name: str) -> str:
     """Usage, and each parameter with its default."""
     from sfa_localization.config import render
 
-    head = rf'^/\*\*/{name}:\n  ros__parameters:\n'
-    (section,) = re.findall(rf'{head}((?: .*\n)*)', render(), re.MULTILINE)
-    parameters = textwrap.indent(textwrap.dedent(section), '  ')
+    parameters = ''
+    for node in [*NODES] if name == COMPOSED else [name]:
+        head = rf'^/\*\*/{node}:\n  ros__parameters:\n'
+        (section,) = re.findall(rf'{head}((?: .*\n)*)', render(), re.MULTILINE)
+        parameters += f'  {node}:\n' if name == COMPOSED else ''
+        parameters += textwrap.indent(textwrap.dedent(section), '  ')
     return (
-        f'{NODES[name]}\n\nusage: {name} [--ros-args [-p NAME:=VALUE] [-r TOPIC:=OTHER] '
+        f'{EXECUTABLES[name]}\n\nusage: {name} [--ros-args [-p NAME:=VALUE] [-r TOPIC:=OTHER] '
         f'[--params-file FILE]]\n\nIt runs until SIGINT or SIGTERM, and writes no file unless a '
         f'parameter names one.\n\nparameters:\n{parameters}'
     )

@@ -354,29 +354,31 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._diagnostics.publish(message)
 
 
-def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
-    """Run a node until SIGINT or SIGTERM; return the exit code of its process.
+def run_nodes(make: Callable[[], Sequence[LocalizationNode]], words: list[str]) -> int:
+    """Run nodes until SIGINT or SIGTERM; return the exit code of their process.
 
     The process must end afterwards, because it ignores signals then.
     """
-    node = None
+    nodes: Sequence[LocalizationNode] = ()
     try:
         _initialize(words)
         executor = SingleThreadedExecutor()  # after a signal it cannot be made
-        node = make()
-        parameters.warn_of_arguments(node, words)
-        node.find_files(words)
-        if not node.start():
-            return CANNOT_START if rclpy.ok() else 0
-        executor.add_node(node)
+        nodes = make()
+        for node in nodes:
+            parameters.warn_of_arguments(node, words)
+            node.find_files(words)
+        for node in nodes:
+            if not node.start():
+                return CANNOT_START if rclpy.ok() else 0
+            executor.add_node(node)
         with one_core():
-            _spin(executor, node)
+            _spin(executor, nodes[0])
     except Exception as error:
         if rclpy.ok() or isinstance(error, LocalizationError):  # else a signal is the cause
             rclpy.logging.get_logger(_PACKAGE).fatal(_reason(error))
-            return DIED if node is not None and node.active else CANNOT_START
+            return DIED if any(node.active for node in nodes) else CANNOT_START
     finally:
-        if node is not None:
+        for node in nodes:
             node.attempt('cleanup', node.teardown)
             node.destroy_node()
         rclpy.try_shutdown()

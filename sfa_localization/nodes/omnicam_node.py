@@ -9,6 +9,7 @@ subscribes, and uses only the newest of images that come too fast.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
@@ -66,6 +67,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         super().__init__('omnicam_node', groups, **options)
         self._config = self.settings(OmnicamNodeConfig)
         self._size: tuple[int, int] | None = None
+        self.hand_over: Callable[[int, Image, str], None] | None = None
+        """Takes each panorama, with stamp and frame, in the same process."""
         self._begin()
 
     def _begin(self) -> None:
@@ -153,7 +156,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
 
     def _wanted(self) -> bool:
         outputs = (self._panoramas, self._compressed)
-        return self.active and any(output.get_subscription_count() for output in outputs)
+        heard = any(output.get_subscription_count() for output in outputs)
+        return self.active and (heard or self.hand_over is not None)
 
     def _follow_demand(self) -> None:
         if self._feed is not None:
@@ -254,6 +258,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         panorama = self._leveled(self._unwrapper(image), stamp_ns)
         frame = self._config.frame_id or frame or 'omnicam'
         self._size = (image.shape[0], image.shape[1])
+        if self.hand_over is not None:
+            self.hand_over(stamp_ns, panorama, frame)
         if self._panoramas.get_subscription_count():
             self._panoramas.publish(convert.to_image(panorama, stamp_ns, frame))
         if self._compressed.get_subscription_count():

@@ -11,6 +11,9 @@ NODES = {
     'sfa_node': 'ROS 2 node: panoramas to slow features and poses.',
     'ekf_node': 'ROS 2 node: poses and odometry to the pose in the map.',
 }
+COMPOSED = 'localization'
+"""The executable that runs all of them in one process."""
+EXECUTABLES = {**NODES, COMPOSED: 'All three nodes in one process, with their parameters.'}
 CANNOT_START = 1
 DIED = 2
 """Exit codes: a launch ends if a node cannot start, and restarts a node that died."""

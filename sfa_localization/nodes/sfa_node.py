@@ -54,6 +54,8 @@ class SfaNode(LocalizationNode):
         self._config = self.settings(SfaNodeConfig)
         self._observer: Observer | None = None
         self._loaded: PlaceModel | None = None
+        self.takes_panoramas = True
+        """From a topic; or omnicam_node, in the same process, hands them over."""
 
     def setup(self) -> None:
         self._observer = Observer(self._load(self._config.model), self.settings(WatchConfig))
@@ -72,10 +74,11 @@ class SfaNode(LocalizationNode):
         self._declared: PanoramaConfig | None = None
         self._info = self.following('panorama/info')
         self.subscribe(String, self._info, self._receive_info, latched)
-        transport = self._config.image_transport
+        transport = self._config.image_transport if self.takes_panoramas else 'raw'
         self._topic = 'panorama' if transport == 'raw' else self.following(f'panorama/{transport}')
         images = ImageInput(self, transport, self._topic, self._locate)
-        images.start()
+        if self.takes_panoramas:
+            images.start()
         self.discovery = Discovery(self, self._topic, images.types, ['panorama'])
 
     def started(self) -> None:
@@ -143,6 +146,13 @@ class SfaNode(LocalizationNode):
             f'panorama is declared to differ from those of training: {differences}; '
             'set these parameters of omnicam_node'
         )
+
+    def receive(self, stamp_ns: int, image: Image, frame: str) -> None:
+        """Take a panorama as if it had come from its topic."""
+        if self.active:
+            self.take(
+                self._topic, lambda panorama: self._locate(*panorama), (stamp_ns, image, frame)
+            )
 
     def _locate(self, stamp_ns: int, image: Image, _: str) -> None:
         assert self._observer is not None
