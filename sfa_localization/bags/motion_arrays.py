@@ -29,19 +29,24 @@ StampedValues = list[tuple[int, Any]]
 _DRIVING_MPS = 0.01  # above the noise of wheel encoders at rest
 
 
-def _stamps(values: StampedValues) -> Stamps:
+def stamps_of(values: StampedValues) -> Stamps:
+    """The stamps (N,) of values."""
     return np.array([stamp for stamp, _ in values], np.int64)
 
 
 def to_trajectory(values: StampedValues) -> Trajectory:
     """Poses at stamps."""
-    return Trajectory(_stamps(values), np.array([pose for _, pose in values], float).reshape(-1, 3))
+    return Trajectory(
+        stamps_of(values), np.array([pose for _, pose in values], float).reshape(-1, 3)
+    )
 
 
-def to_yaw_rate(values: StampedValues) -> YawRate:
-    """Yaw rates at stamps; the values are omega and its variance."""
-    rates = np.array([rate for _, rate in values], float).reshape(-1, 2)
-    return YawRate(_stamps(values), rates[:, 0], rates[:, 1])
+def to_yaw_rate(values: StampedValues) -> YawRate | None:
+    """Yaw rates at stamps, None without any; the values are omega and its variance."""
+    if not values:
+        return None
+    rates = np.array([rate for _, rate in values], float)
+    return YawRate(stamps_of(values), rates[:, 0], rates[:, 1])
 
 
 def to_points(values: StampedValues, lever: complex = 0j) -> Points:
@@ -61,7 +66,7 @@ def to_odometry(values: StampedValues, topic: str) -> tuple[Odometry, list[str],
     None where messages have only poses: then twists are the differences of poses. Raises DataError
     for two publishers, and where nothing is filled.
     """
-    stamps = _stamps(values)
+    stamps = stamps_of(values)
     poses = np.array([pose for _, (pose, _) in values], float)
     poses = poses.reshape(-1, 3)
     has_twist = bool(values) and values[0][1][1] is not None
