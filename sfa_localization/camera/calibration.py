@@ -143,34 +143,40 @@ def _find_circle(cue: Array, rng: np.random.Generator, rim: Circle | None) -> Ci
 
 def _coarse_circle(cue: Array, contrast: float, rim: Circle | None, scale: float) -> Array:
     """Column, row, radius at scale 1 of the clearest circle in the cue shrunk by `scale`."""
-    height, width = cue.shape
+    centers, radii = _candidates(cue.shape, rim, scale)
+    hole = rim is not None
+    circles = [_sides(cue, centers, radius, _COARSE_RAYS, hole) for radius in radii]
+    clearness = np.array([_clearness(*sides, contrast) for sides in circles])
+    size, place = np.unravel_index(np.argmax(clearness), clearness.shape)
+    return np.array([*centers[place], radii[size]]) / scale
+
+
+def _candidates(size: tuple[int, ...], rim: Circle | None, scale: float) -> tuple[Array, Array]:
+    """Centers (N, 2) and radii (M,) of circles, in a cue of a size shrunk by `scale`."""
+    height, width = size
     if rim is None:
         middle = np.array([width, height]) / 2
         steps = [np.arange(-0.3, 0.31, _COARSE_STEP / side) * side for side in (width, height)]
-        radii = np.geomspace(0.2 * min(cue.shape), 0.6 * math.hypot(*cue.shape), 40)
+        radii = np.geomspace(0.2 * min(size), 0.6 * math.hypot(*size), 40)
     else:
         middle = np.array([rim.column, rim.row]) * scale
         reach = rim.radius * scale
         steps = [np.linspace(-0.1, 0.1, 7) * reach] * 2
         radii = np.geomspace(max(0.05 * reach, 2.0), 0.6 * reach, 30)
-    centers = middle + np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
-    best = -np.inf
-    circle = np.array([*middle, radii[0]])
-    for radius in radii:
-        bright, dark = _sides(cue, centers, radius, _COARSE_RAYS, rim is not None)
-        visible = np.isfinite(dark).mean(1)
-        kept = visible >= _RIM_SUPPORT
-        if not kept.any():
-            continue
-        bright = bright[kept]
-        dark = dark[kept]
-        level = np.nanmedian(dark, axis=1, keepdims=True) + contrast
-        score = np.mean((bright > level) & (dark < level), 1) - np.mean(dark >= level, 1)
-        score /= visible[kept] + _RIM_SUPPORT  # directions beyond the border do not count
-        if score.max() > best:
-            best = float(score.max())
-            circle = np.array([*centers[kept][np.argmax(score)], radius])
-    return circle / scale
+    return middle + np.stack(np.meshgrid(*steps), -1).reshape(-1, 2), radii
+
+
+def _clearness(bright: Array, dark: Array, contrast: float) -> Array:
+    """How clear circles are (N,) by values (N, rays) on their sides, -inf where hardly visible."""
+    visible = np.isfinite(dark).mean(1)
+    kept = visible >= _RIM_SUPPORT
+    clearness = np.full(len(dark), -np.inf)
+    dark = dark[kept]
+    level = np.nanmedian(dark, axis=1, keepdims=True) + contrast
+    share = np.mean((bright[kept] > level) & (dark < level), 1) - np.mean(dark >= level, 1)
+    # Directions beyond the border do not count.
+    clearness[kept] = share / (visible[kept] + _RIM_SUPPORT)
+    return clearness
 
 
 def _values(cue: Array, points: Complex, order: int) -> Array:
