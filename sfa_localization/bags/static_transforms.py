@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sfa_localization.bags import decoding
 from sfa_localization.bags.reader import Bag
@@ -52,16 +51,23 @@ def _links(message: object) -> dict[str, tuple[str, Array]]:
     for part in message.transforms:  # type: ignore[attr-defined]
         moved = part.transform.translation
         turned = part.transform.rotation
-        quaternion = (turned.x, turned.y, turned.z, turned.w)
-        require_sane('transform', moved.x, moved.y, moved.z, *quaternion)
-        if not any(quaternion):
-            raise MessageError('quaternion is zero')
+        require_sane('transform', moved.x, moved.y, moved.z, turned.x, turned.y, turned.z, turned.w)
         matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+        matrix[:3, :3] = _rotation(np.array([turned.x, turned.y, turned.z]), float(turned.w))
         matrix[:3, 3] = moved.x, moved.y, moved.z
         parent = part.header.frame_id.lstrip('/')
         links[part.child_frame_id.lstrip('/')] = parent, matrix
     return links
+
+
+def _rotation(axis: Array, real: float) -> Array:
+    """Rotation (3, 3) of a quaternion of any length but zero. Raises MessageError."""
+    square = float(axis @ axis) + real**2
+    if square == 0.0:
+        raise MessageError('quaternion is zero')
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + 2 * (real * cross + cross @ cross) / square)
 
 
 def _to_root(frame: str, parents: dict[str, tuple[str, Array]]) -> tuple[str, Array]:
