@@ -19,6 +19,7 @@ from scipy.ndimage import map_coordinates
 from sfa_localization.camera.calibration_files import CALIBRATION_TITLE, read_calibration
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper, panorama_rays
+from sfa_localization.camera.point_tracks import mean_and_change
 from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.files import first_bytes
@@ -64,14 +65,14 @@ class MirrorCircles:
     hole: Circle | None
 
 
-def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
+def find_circles(images: Sequence[Image]) -> MirrorCircles:
     """Find the rim of the mirror, and its hole, in images (H, W, 3) of one size.
 
     Just outside of the rim the image is dark or, in several images taken while driving, does not
     change; the cue with the clearer circle counts. The same holds just inside of the hole. Raises
     CameraError when no circle stands out.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     scale = min(_SEARCHED_PX / max(images[0].shape), 1.0)
     cues = _cues(images, scale)
 
@@ -99,21 +100,16 @@ def _enlarged(circle: Circle, scale: float) -> Circle:
 
 def _cues(images: Sequence[Image], scale: float) -> list[Array]:
     """Brightness and, of enough images, change (h, w), 0..255: the mirror differs in them."""
-    sums = squares = np.zeros(0)
-    for number, image in enumerate(images):
+    grays = list[Array]()
+    for number, image in enumerate(images, 1):
         gray = _scaled(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), scale)
-        gray = np.asarray(cv2.GaussianBlur(gray, (0, 0), 1.0), float)
-        if number and gray.shape != sums.shape:
+        grays.append(np.asarray(cv2.GaussianBlur(gray, (0, 0), 1.0), float))
+        if gray.shape != grays[0].shape:
             raise CameraError(
-                f'image {number + 1} differs in size from the first: give images of one camera'
+                f'image {number} differs in size from the first: give images of one camera'
             )
-        sums, squares = (sums + gray, squares + gray**2) if number else (gray, gray**2)
-    brightness = sums / len(images)
-    if len(images) < _ENOUGH_FOR_MOTION:
-        return [brightness]
-    variance = squares / len(images) - brightness**2
-    change = cv2.GaussianBlur(np.sqrt(np.maximum(variance, 0)), (0, 0), 2.0)
-    return [brightness, np.asarray(change, float)]
+    brightness, change = mean_and_change(grays)
+    return [brightness] if len(images) < _ENOUGH_FOR_MOTION else [brightness, change]
 
 
 def _scaled(cue: Any, scale: float) -> Array:

@@ -18,6 +18,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import ArrayLike, NDArray
 
+from sfa_localization.camera.leveling import resampled
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.sphere import directions, rotation
@@ -141,8 +142,7 @@ def raw_view(unproject: Callable[[Array], Array], size: tuple[int, int]) -> View
     hull = np.nan_to_num(_hull(azimuth, elevation)).reshape(*size, 3)
 
     def image(dome_image: Floats, gain: Floats) -> Floats:
-        wrapped = np.concatenate([dome_image[:, -1:], dome_image, dome_image[:, :1]], 1)
-        scene = cv2.remap(wrapped, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        scene = resampled(dome_image, map_x, map_y)
         return np.asarray((scene * (1 - cover[..., None]) + hull * cover[..., None]) * gain)
 
     return View(dome, image)
