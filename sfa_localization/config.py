@@ -22,7 +22,7 @@ from sfa_localization.camera.settings import (
     WatchConfig,
 )
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.data.files import atomic_write, read_text
+from sfa_localization.data.files import read_text, write_bytes
 from sfa_localization.data.plain_yaml import LONGEST, load_yaml
 from sfa_localization.data.rejections import quoted
 from sfa_localization.data.settings import Settings, nearest
@@ -256,8 +256,7 @@ def render(changes: Mapping[str, Mapping[str, Any]] | None = None) -> str:
 
 def write_config(path: Path | str, changes: Mapping[str, Mapping[str, Any]] | None = None) -> None:
     """Write `render(changes)` to a file, atomically. Raises ConfigError."""
-    with atomic_write(Path(path), ConfigError) as file:
-        file.write(render(changes).encode())
+    write_bytes(Path(path), render(changes).encode(), ConfigError)
 
 
 def _group(kind: type[Settings], changes: Mapping[str, Any]) -> str:

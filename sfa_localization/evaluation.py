@@ -12,7 +12,7 @@ import logging
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import starmap
 from pathlib import Path
@@ -166,11 +166,7 @@ def _judged(
     poses |= {name: moved(track.poses, transform) for name, track in tracks.items()}
     axes = [1.0, 1.0, 1.0 if truth.headings else np.nan]
     estimates = {name: Trajectory(p.stamps_ns, p.poses * axes) for name, p in poses.items()}
-    scores = {name: score(truth.poses, estimate) for name, estimate in estimates.items()}
-    turn = rotation(transform.yaw_rad)
-    for name, track in tracks.items():
-        scores[name] |= calibration(truth.poses, estimates[name], turn, track.covariances)
-        scores[name]['similarity'] = similarity(truth.poses, estimates[name])
+    scores = _scores(truth.poses, estimates, tracks, rotation(transform.yaw_rad))
     localised = np.array([level is Level.LOCALISED for _, level, state in outputs if state], bool)
     wrong_s = _false_localised_s(truth.poses, estimates['ekf'], localised)
     counts = {**_counts(drive, outputs, fused), 'false_localised_s': wrong_s}
@@ -178,6 +174,22 @@ def _judged(
     return Evaluation(
         truth.poses, estimates, scores, counts, features, aligned_on, transform, corrections
     )
+
+
+def _scores(
+    truth: Trajectory,
+    estimates: Mapping[str, Trajectory],
+    tracks: Mapping[str, FilterTrack],
+    turn: Array,
+) -> Scores:
+    """Errors of the estimates, and of the tracks behind them, which `turn` (2, 2) rotates to the
+    truth, also whether their covariances are right.
+    """
+    scores = {name: score(truth, estimate) for name, estimate in estimates.items()}
+    for name, track in tracks.items():
+        scores[name] |= calibration(truth, estimates[name], turn, track.covariances)
+        scores[name]['similarity'] = similarity(truth, estimates[name])
+    return scores
 
 
 def observed(

@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from collections import Counter
 from collections.abc import Sequence
 from decimal import Decimal
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -68,28 +68,45 @@ def read_table(path: Path | str, names: Sequence[str]) -> Table:
     Cells are separated by commas or spaces. A line above them may name the columns in any order;
     the time may be `stamp_ns`. Lines that begin with # are comments. Raises DataError.
     """
-    lines = [line.strip() for line in read_text(path, LARGEST_LOG, DataError).splitlines()]
-    numbers = [k for k, line in enumerate(lines, 1) if line and line[0] != '#']
-    rows = [_SEPARATOR.split(lines[number - 1]) for number in numbers]
-    named = bool(rows) and math.isnan(_number(rows[0], 0))
-    header = [cell.strip('"') for cell in rows[0]] if named else list(names)
-    rows = rows[named:]
-    numbers = numbers[named:]
+    lines = map(str.strip, read_text(path, LARGEST_LOG, DataError).splitlines())
+    numbered = enumerate(lines, 1)
+    rows = {n: _SEPARATOR.split(line) for n, line in numbered if line and line[0] != '#'}
+    header = _header(rows) or list(names)
     stamp, scale = ('stamp_ns', 1) if 'stamp_ns' in header else (names[0], SECOND_NS)
     for name in (stamp, *names[1:3]):
         if name not in header:
             raise DataError(f'{path}: no column {name} among {short_line(", ".join(header))}')
-    first = header.index(stamp)
-    at = [header.index(name) if name in header else len(header) for name in names[1:]]
-    read = [(_nanoseconds(row, first, scale), [_number(row, k) for k in at]) for row in rows]
-    right = [ns is not None and math.isfinite(cells[0] + cells[1]) for ns, cells in read]
-    if not any(right):
+    at = [header.index(name) if name in header else len(header) for name in (stamp, *names[1:])]
+    read = {number: _read(row, at, scale) for number, row in rows.items()}
+    used = {number: cells for number, cells in read.items() if cells}
+    if not used:
         wanted = f'{stamp}, {names[1]} and {names[2]}'
         raise DataError(f'{path}: none of its {len(rows)} rows has {wanted}, in these units')
-    used = sorted(itertools.compress(read, right), key=lambda row: row[0] or 0)
-    stamps, values = (np.array(column) for column in zip(*used, strict=True))
-    skipped = tuple(number for number, good in zip(numbers, right, strict=True) if not good)
-    return Table(stamps.astype(np.int64), values, skipped, str(path))
+    stamps, values = zip(*sorted(used.values(), key=itemgetter(0)), strict=True)
+    skipped = tuple(number for number in rows if number not in used)
+    return Table(np.array(stamps, np.int64), np.array(values), skipped, str(path))
+
+
+def _header(rows: dict[int, list[str]]) -> list[str]:
+    """The names of columns in the first of the rows, which is taken out; none where it is data."""
+    first = next(iter(rows), 0)
+    if not rows or not math.isnan(_number(rows[first], 0)):
+        return []
+    return [cell.strip('"') for cell in rows.pop(first)]
+
+
+def _read(row: list[str], columns: Sequence[int], scale: int) -> tuple[int, list[float]] | None:
+    """The stamp and the other cells of a row, None where one of the first three is missing.
+
+    The stamp is exact, which a float cannot be, and of these centuries.
+    """
+    cells = [_number(row, column) for column in columns[1:]]
+    try:
+        stamp_ns = int(Decimal(row[columns[0]]) * scale)
+    except (ArithmeticError, ValueError, IndexError):
+        return None
+    usable = abs(stamp_ns) < 2**62 and math.isfinite(cells[0] + cells[1])
+    return (stamp_ns, cells) if usable else None
 
 
 def _number(row: list[str], column: int) -> float:
@@ -97,15 +114,6 @@ def _number(row: list[str], column: int) -> float:
         return float(row[column])
     except (ValueError, IndexError):
         return math.nan
-
-
-def _nanoseconds(row: list[str], column: int, scale: int) -> int | None:
-    """Exact nanoseconds, which a float cannot hold; None of what is no stamp of these centuries."""
-    try:
-        stamp_ns = int(Decimal(row[column]) * scale)
-    except (ArithmeticError, ValueError, IndexError):
-        return None
-    return stamp_ns if abs(stamp_ns) < 2**62 else None
 
 
 def run_filter(
@@ -116,15 +124,7 @@ def run_filter(
     The errors of positions are white, as those of a sensor. Raises DataError when the tables do not
     overlap.
     """
-    (a, b), (c, d) = ((int(t.stamps_ns[0]), int(t.stamps_ns[-1])) for t in (odometry, positions))
-    if a > d or c > b:
-        raise DataError(
-            f'odometry from {odometry.source} ({_seconds(a)} to {_seconds(b)} s) and positions '
-            f'from {positions.source} ({_seconds(c)} to {_seconds(d)} s) have no time in common: '
-            'bring both to one clock'
-        )
-    # Logs may count from zero, but to the filter zero means no stamp.
-    shift = max(0, SECOND_NS - min(a, c))
+    shift = _shift(odometry, positions)
     fused = PoseFilter(config, ErrorCorrelation(share=0.0))
     twists = np.nan_to_num(odometry.values)
     no_poses = np.full((len(twists), 3), np.nan)
@@ -137,20 +137,30 @@ def run_filter(
     updates = list[Update]()
     for stamp_ns, _, update in progress_over(steps, 'filter', total, 'rows', visible=progress):
         if update is not None:
-            updates.append(update)
+            updates.append(update._replace(stamp_ns=update.stamp_ns - shift))
         else:
             moved_ns = stamp_ns
         if stamp_ns == moved_ns and (state := fused.at(stamp_ns)):
             states[stamp_ns] = state
     track = FilterTrack.of([*states.values()])
-    return Filtered(
-        track.poses.stamps_ns - shift,
-        track.poses.poses,
-        track.covariances,
-        tuple(update._replace(stamp_ns=update.stamp_ns - shift) for update in updates),
-        fused.counts,
-        fused.status,
-    )
+    stamps_ns = track.poses.stamps_ns - shift
+    estimates = (stamps_ns, track.poses.poses, track.covariances)
+    return Filtered(*estimates, tuple(updates), fused.counts, fused.status)
+
+
+def _shift(odometry: Table, positions: Table) -> int:
+    """What to add to stamps, ns: logs may count from zero, but to the filter zero means no stamp.
+
+    Raises DataError when the tables do not overlap.
+    """
+    (a, b), (c, d) = ((int(t.stamps_ns[0]), int(t.stamps_ns[-1])) for t in (odometry, positions))
+    if a > d or c > b:
+        raise DataError(
+            f'odometry from {odometry.source} ({_seconds(a)} to {_seconds(b)} s) and positions '
+            f'from {positions.source} ({_seconds(c)} to {_seconds(d)} s) have no time in common: '
+            'bring both to one clock'
+        )
+    return max(0, SECOND_NS - min(a, c))
 
 
 class _Position(NamedTuple):

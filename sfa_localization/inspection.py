@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,10 +21,10 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 from sfa_localization.bags import decoding
 from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S, ReadingRecipe
 from sfa_localization.bags.lens_drive import lens_of
-from sfa_localization.bags.motion_arrays import to_yaw_rate
+from sfa_localization.bags.motion_arrays import stamps_of, to_yaw_rate
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import TopicNames
-from sfa_localization.bags.topic_stream import Stream, clock_offset
+from sfa_localization.bags.topic_stream import Stream, by_one_clock
 from sfa_localization.camera import body, kinds, lens_report
 from sfa_localization.camera.leveling import leaning
 from sfa_localization.camera.panorama import looks_like_panorama
@@ -307,82 +307,85 @@ def _topic_of(bag: Bag, kind: str, name: str, report: BagReport) -> str:
         return ''
 
 
+class _View(NamedTuple):
+    """What is kept of an image: the turn of the camera since the first image, rad, a small texture,
+    None if it repeats the last image, and of some panoramas the local contrast.
+    """
+
+    yaw: float
+    texture: NDArray[np.int8] | None
+    contrast: NDArray[np.int8] | None
+
+
 class _Survey:
     """One pass over all topics of a bag."""
 
     def __init__(self, bag: Bag, report: BagReport, topics: TopicNames, clockwise: bool) -> None:
         self._bag = bag
         self._report = report
-        # None without a topic: in damaged bags, '' can be the name of a topic.
-        self._image = report.image_topic or None
-        self._odometry = report.odometry_topic.partition(':')[0] or None
-        recorded = [topic.kind for topic in bag.topics.values() if topic.count]
-        has_imu = topics.imu or decoding.IMU in recorded
-        self._imu = (_topic_of(bag, 'imu', topics.imu, report) if has_imu else '') or None
-        self._values: dict[str | None, list[tuple[int, Any]]] = {name: [] for name in bag.topics}
         self._gyro = VisualGyro(clockwise)
         self._frozen = FrozenWatch()
         self._repeats = 0
         self._sizes: Counter[tuple[int, ...]] = Counter()
-        count = bag.topics[self._image].count if self._image else 0
-        self._every = max(count // SAMPLES, 1)
-        self._tilt_every = -(-count // body.IMAGES) or 1
         self._sphere = PanoramaConfig(clockwise=clockwise).sphere
         self._rolls_and_pitches: list[tuple[float, float]] = []
+        has_imu = bag.has('imu', topics.imu)
+        imu = _topic_of(bag, 'imu', topics.imu, report) if has_imu else ''
+        self._used = dict[str, Stream]()
+        # Without a topic, '' is no name: in damaged bags, it can be one.
+        for use, name, convert in (
+            ('images', report.image_topic, self._take),
+            ('odometry', report.odometry_topic, decoding.odometry_of),
+            ('imu', imu, self._yaw_rate),
+        ):
+            if name:
+                self._used[use] = bag.stream(name, convert)
+                self._used[use].required = False
+        count = bag.topics[report.image_topic].count if report.image_topic else 0
+        self._every = max(count // SAMPLES, 1)
+        self._tilt_every = -(-count // body.IMAGES) or 1
 
     def fill(self) -> None:
         """Read the bag, and fill the report."""
-        streams = {name: self._stream(name) for name in self._bag.topics}
-        for stream, stamp_ns, value in self._bag.read(streams.values()):
-            self._values[stream.topic].append((stamp_ns, value))
+        bag = self._bag
         report = self._report
-        samples = self._report.samples
-        report.topics = [self._topic(stream) for stream in streams.values()]
-        if samples:
+        used = {stream.topic: stream for stream in self._used.values()}
+        # Other images are decoded to detect damage, and not kept.
+        streams = [
+            used.get(name) or bag.stream(name, lambda _: None, required=False)
+            for name in bag.topics
+        ]
+        bag.collect(streams)
+        report.topics = [self._topic(stream) for stream in streams]
+        if samples := report.samples:
             ((height, width), _), *_ = self._sizes.most_common(1)
             alike = [sample for sample in samples if sample.shape == samples[0].shape]
             report.camera = kinds.CameraKind(*kinds.guess_geometry(alike)[:2], width, height)
-        odometry = streams[self._odometry] if self._odometry else None
-        if odometry is None or not self._values[self._odometry]:
+        odometry = self._used.get('odometry')
+        if odometry is None or not odometry.values:
             return
-        for name, topic in (('images', self._image), ('gyroscope', self._imu)):
-            if topic:
-                ahead_ns, text = clock_offset(name, streams[topic], odometry)
-                self._values[topic] = [(at - ahead_ns, value) for at, value in self._values[topic]]
-                report.notes += [text] if text else []
+        report.notes += by_one_clock(self._used)
         try:
-            self._drive(self._bag.to_odometry(odometry, self._values[self._odometry]))
+            self._drive(bag.to_odometry(odometry, odometry.values))
         except BagError as error:
-            report.lacks.append(str(error).removeprefix(f'{self._bag.path}: '))
+            report.lacks.append(str(error).removeprefix(f'{bag.path}: '))
 
-    def _stream(self, name: str) -> Stream:
-        if name == self._odometry:
-            stream = self._bag.stream(self._report.odometry_topic, decoding.odometry_of)
-            stream.required = False
-            return stream
-        convert = {self._image: self._take, self._imu: self._yaw_rate}.get(name)
-        # Other images are decoded to detect damage, and not kept.
-        return self._bag.stream(name, convert or (lambda _: None), required=False)
-
-    def _take(self, image: Image) -> tuple[float, NDArray[np.int8] | None, NDArray[np.int8] | None]:
-        """Keep a sample of the images now and then.
-
-        Returns the turn of the camera since the first image, rad, a small texture of the image,
-        None if it repeats the last one, and now and then one of local contrast, of panoramas.
-        """
+    def _take(self, image: Image) -> _View:
+        """Keep a sample of the images now and then, and what shows turns of each."""
         samples = self._report.samples
-        new = self._frozen.add(image)
-        self._repeats += not new
-        if self._sizes.total() % self._every == 0 and len(samples) < SAMPLES:
-            scale = min(SAMPLE_SIDE / max(image.shape[:2]), 1.0)
+        number = self._sizes.total()
+        size = image.shape[:2]
+        self._sizes[size] += 1
+        if number % self._every == 0 and len(samples) < SAMPLES:
+            scale = min(SAMPLE_SIDE / max(size), 1.0)
             small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
             samples.append(np.asarray(small, np.uint8))
-        chosen = self._sizes.total() % self._tilt_every == 0
-        chosen = chosen and looks_like_panorama(*image.shape[:2])
-        self._sizes[image.shape[:2]] += 1
         yaw = self._gyro.add(kinds.unrolled(image))
+        new = self._frozen.add(image)
+        self._repeats += not new
+        chosen = number % self._tilt_every == 0 and looks_like_panorama(*size)
         contrast = quantized(texture(image)[None]) if chosen else None
-        return yaw, self._gyro.texture if new else None, contrast
+        return _View(yaw, self._gyro.texture if new else None, contrast)
 
     def _yaw_rate(self, message: Any) -> tuple[float, float]:
         """Yaw rate and its variance from an Imu; roll and pitch are kept if it has them."""
@@ -392,8 +395,7 @@ class _Survey:
 
     def _topic(self, stream: Stream) -> TopicReport:
         topic = self._bag.topics[stream.topic]
-        stamps = np.array([stamp for stamp, _ in self._values[topic.name]], np.int64)
-        report = TopicReport(topic.name, topic.kind, topic.count, stamps)
+        report = TopicReport(topic.name, topic.kind, topic.count, stamps_of(stream.values))
         report.problems = list(self._problems(stream, report))
         return report
 
@@ -404,7 +406,7 @@ class _Survey:
             yield 'no messages'
         if report.pauses:
             yield f'pause of {report.largest_gap_s:.1f} s'
-        if stream.topic != self._image:
+        if stream is not self._used.get('images'):
             return
         if len(self._sizes) > 1:
             yield f'images of several sizes: {", ".join(f"{w}x{h}" for h, w in self._sizes)}'
@@ -414,38 +416,40 @@ class _Survey:
     def _drive(self, odometry: Odometry) -> None:
         """Fill in the path, the tilt, and the comparison with images and gyroscope."""
         report = self._report
-        camera = self._report.camera
-        images = self._values.get(self._image, [])
-        stamps = np.array([stamp for stamp, _ in images], np.int64)
-        yaw = np.array([yaw for _, (yaw, *_) in images], float)
-        new = [(stamp, small) for stamp, (_, small, _) in images if small is not None]
-        views = (np.array([s for s, _ in new]), np.stack([t for _, t in new])) if new else None
+        images = self._used['images'].values if 'images' in self._used else []
+        stamps = stamps_of(images)
+        views = [view for _, view in images]
         if self._rolls_and_pitches:
             tilt = np.degrees(np.std(self._rolls_and_pitches, 0).mean())
             report.tilt = f'tilts the robot by {tilt:.1f} degrees'
-        text = frozen(self._repeats, len(stamps))
-        report.lacks += [text] if text else []
-        shows_turns = camera is not None and camera.shows_turns and not text
-        turns = (stamps, yaw) if shows_turns else None
-        rates = self._values.get(self._imu, [])
-        gyro = to_yaw_rate(sorted(rates)) if rates else None
-        is_panorama = camera is not None and camera.is_panorama
-        commands = OpenLoop.of(odometry.twists).repeats
-        report.motion = check_motion(odometry, turns, gyro, is_panorama, views, commands)
-        contrasts = {k: c for k, (_, (*_, c)) in enumerate(images) if c is not None}
-        self._see(odometry, stamps, contrasts)
+        report.motion = self._compared(odometry, stamps, views)
+        self._see(odometry, stamps, views)
         near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
         broken = report.motion.odometry
         report.odometry = odometry
         part = broken.part[np.searchsorted(broken.stamps_ns[1:-1], near, 'right')]
         report.drives = np.split(odometry.trajectory.at(near), np.flatnonzero(np.diff(part)) + 1)
 
-    def _see(
-        self, odometry: Odometry, stamps: Stamps, contrasts: dict[int, NDArray[np.int8]]
-    ) -> None:
+    def _compared(self, odometry: Odometry, stamps: Stamps, views: Sequence[_View]) -> MotionCheck:
+        """The comparison of odometry, gyroscope, and images at stamps (N,)."""
+        camera = self._report.camera
+        text = frozen(self._repeats, len(stamps))
+        self._report.lacks += [text] if text else []
+        turns = None
+        if camera and camera.shows_turns and not text:
+            turns = stamps, np.array([view.yaw for view in views])
+        small = {row: view.texture for row, view in enumerate(views) if view.texture is not None}
+        textures = (stamps[[*small]], np.stack([*small.values()])) if small else None
+        gyro = to_yaw_rate(self._used['imu'].values) if 'imu' in self._used else None
+        is_panorama = camera is not None and camera.is_panorama
+        commands = OpenLoop.of(odometry.twists).repeats
+        return check_motion(odometry, turns, gyro, is_panorama, textures, commands)
+
+    def _see(self, odometry: Odometry, stamps: Stamps, views: Sequence[_View]) -> None:
         """Fill in what hides the view, and the tilt, by the local contrasts of some of the images
         at stamps (N,), where these are panoramas of one size.
         """
+        contrasts = {row: v.contrast for row, v in enumerate(views) if v.contrast is not None}
         if len({contrast.shape for contrast in contrasts.values()}) != 1:
             return
         rows = np.array([*contrasts])

@@ -141,14 +141,22 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     sphere = given.recipe.panorama.sphere
     keyframe_map = learn_keyframes(given.views, segments, result, sphere, TURN_RADIUS_M)
     result = replace(result, forecast=result.forecast.improved(keyframe_map.improvement))
-    quality: dict[str, Any] = {'features_used': first.map.features, 'turned': turned is not None}
-    quality |= {'delta': network.deltas[-1].tolist(), 'rank': [*map(list, network.ranks)]}
-    quality |= segments.points.quality(result.points) if segments.points else {}
-    quality |= {'origin': origin} if (origin := given.runs[-1].origin) else {}
-    quality |= {'segments': len(segments), **images.quality, **result.quality}
-    quality |= keyframe_map.quality
+    points = segments.points.quality(result.points) if segments.points else {}
+    origin = given.runs[-1].origin
+    quality: dict[str, Any] = {
+        'features_used': first.map.features,
+        'turned': turned is not None,
+        'delta': network.deltas[-1].tolist(),
+        'rank': [*map(list, network.ranks)],
+        **points,
+        **({'origin': origin} if origin else {}),
+        'segments': len(segments),
+        **images.quality,
+        **result.quality,
+        **keyframe_map.quality,
+    }
     rig = rig_of(given.drives, segments)
-    drive = np.concatenate([np.full(len(segment.images), segment.run) for segment in segments])
+    drive = np.repeat([s.run for s in segments], [len(s.images) for s in segments])
     model = PlaceModel(
         network,
         result.map,

@@ -112,12 +112,8 @@ class TrainingInput:
         closures = find_closures(views, recipe.panorama.clockwise)
         runs = same_scale(runs, closures)
         points = points_of(runs, recipe.metric.points)
-        lever_arm = next((run.camera for run in runs if run.camera is not None), None)  # by tf
-        if recipe.metric.camera_xy:
-            lever_arm = complex(*recipe.metric.camera_xy)
         items = tuple(map(drive_of, runs))
-        tracked = (lens.place, PLACE_STD_M) if lens else None
-        mount = replace(Mount.at(lever_arm), tracked=tracked)
+        mount = mount_of(runs, recipe.metric.camera_xy, lens)
         drives = Drives(items, closures, recipe.segments, points=points, mount=mount)
         drives = drives.measured(views, sphere)
         return cls(drives, views, recipe, seen, lean, progress)
@@ -279,6 +275,14 @@ def without_hidden(runs: Sequence[Run], sphere: Sphere) -> list[Run]:
     return [
         replace(run, panoramas=MaskedPanoramas.of(run.panoramas, seen), seen=seen) for run in runs
     ]
+
+
+def mount_of(runs: Sequence[Run], camera_xy: Sequence[float], lens: LearnedLens | None) -> Mount:
+    """Where the camera sits: as given by `camera_xy`, m, or by tf, and as its lens shows it."""
+    lever_arm = next((run.camera for run in runs if run.camera is not None), None)  # by tf
+    if camera_xy:
+        lever_arm = complex(*camera_xy)
+    return replace(Mount.at(lever_arm), tracked=(lens.place, PLACE_STD_M) if lens else None)
 
 
 def drive_of(run: Run) -> Drive:

@@ -10,7 +10,7 @@ keyframes of the training stay as they are.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,13 @@ from sfa_localization.camera.leveling import LeveledPanoramas
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.geometry import Array, Mask, wrap_angle
 from sfa_localization.data.progress import progress_over
 from sfa_localization.data.run import PanoramaArray, Panoramas, Run
 from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
 from sfa_localization.fusion.camera_clock import camera_clock
+from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
@@ -135,27 +136,38 @@ def new_views(
     smoother = filter_of(model, replace(config, degraded_std=config.lost_std), Smoother)
     images = Observer(model, watch).observe_run(run)
     images = progress_over(images, f'replay {run.name}', len(run.panoramas), visible=progress)
-    observations = list[Observation]()
-    localised = list[bool]()
-    for _, observation, _ in replay(smoother, run.odometry, run.panoramas.stamps_ns, images):
-        if observation is not None:
-            observations.append(observation)
-            localised.append(smoother.status.level is Level.LOCALISED)
-    if not any(localised):
-        raise DataError(
-            f'{run.name}: the robot is never LOCALISED on this drive, so the places of its images '
-            'are unknown: train anew, with the bags of the first training and this one'
-        )
+    observations, localised = _replayed(smoother, run, images)
     assert isinstance(smoother, Smoother)
     poses, certain = _smoothed(smoother, model, run)
     usual = usual_explained(model)
     novel = np.array([not image.problem and image.explained < usual for image in observations])
     agree = np.array([_agrees(*pair) for pair in zip(observations, poses, strict=True)])
-    chosen = np.flatnonzero(np.array(localised) & certain & novel & agree)
+    chosen = np.flatnonzero(localised & certain & novel & agree)
     chosen = chosen[_spread(poses[chosen])]
     tilts = np.reshape([image.tilt for image in observations], (-1, 2))
     textures = _textures(model, run.panoramas, chosen, tilts[chosen])
     return Additions(textures, model.rig.camera(poses[chosen]))
+
+
+def _replayed(
+    fused: PoseFilter, run: Run, images: Iterable[Observation]
+) -> tuple[list[Observation], Mask]:
+    """The N images of a drive, and a mask (N,) of those after which the robot was LOCALISED.
+
+    Raises DataError if it never was.
+    """
+    observations = list[Observation]()
+    localised = list[bool]()
+    for _, observation, _ in replay(fused, run.odometry, run.panoramas.stamps_ns, images):
+        if observation is not None:
+            observations.append(observation)
+            localised.append(fused.status.level is Level.LOCALISED)
+    if not any(localised):
+        raise DataError(
+            f'{run.name}: the robot is never LOCALISED on this drive, so the places of its images '
+            'are unknown: train anew, with the bags of the first training and this one'
+        )
+    return observations, np.array(localised)
 
 
 def usual_explained(model: PlaceModel) -> float:
@@ -169,7 +181,7 @@ def usual_explained(model: PlaceModel) -> float:
     return float(np.quantile(explained, _QUANTILE))
 
 
-def _smoothed(smoother: Smoother, model: PlaceModel, run: Run) -> tuple[Array, NDArray[np.bool_]]:
+def _smoothed(smoother: Smoother, model: PlaceModel, run: Run) -> tuple[Array, Mask]:
     """Smoothed poses (N, 3) of the images, and a mask (N,) of those that are certain."""
     smoothed = FilterTrack.of(smoother.smoothed())
     track = smoothed.poses

@@ -142,7 +142,7 @@ class Echo(LocalizationNode):
         if self.calls < 3:
             raise LocalizationError('not ready') if self.calls == 1 else ZeroDivisionError
 
-    def fail(self, request, response):
+    def fail(self, request):
         raise LocalizationError('no model; give one')
 
     def health(self):

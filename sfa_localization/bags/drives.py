@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.bags import decoding
-from sfa_localization.bags.motion_arrays import StampedValues, to_points, to_trajectory, to_yaw_rate
+from sfa_localization.bags.motion_arrays import stamps_of, to_points, to_trajectory, to_yaw_rate
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.satellite_fixes import in_plane
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.static_transforms import lever_arm
-from sfa_localization.bags.topic_stream import Stream, clock_offset
+from sfa_localization.bags.topic_stream import Stream, by_one_clock
 from sfa_localization.camera.leveling import LeveledPanoramas, tilts_at
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
@@ -31,16 +31,22 @@ from sfa_localization.data.files import replaced_mode
 from sfa_localization.data.geometry import Mask
 from sfa_localization.data.messages import read_tilt, read_yaw_rate
 from sfa_localization.data.progress import progress_bar
-from sfa_localization.data.run import Image, Origin, PanoramaArray, Panoramas, Points, Run, Stamps
+from sfa_localization.data.run import (
+    Image,
+    Origin,
+    PanoramaArray,
+    Panoramas,
+    Points,
+    Run,
+    Stamps,
+    Trajectory,
+)
 from sfa_localization.data.sphere import Sphere
 
 ODOMETRY_TOLERANCE_S = 0.5
 """An image is used when odometry before and after it is this near (s); poses are not interpolated
 over a longer pause."""
 _SAME_IMAGE_NS = 1_000_000  # stamps of one image differ by less
-# Uses of topics whose messages are sent when measured, in words.
-_STAMPED_AT_ONCE = {'images': 'images', 'imu': 'gyroscope', 'orientation': 'orientation',
-                    'ground_truth': 'ground truth'}  # fmt: skip
 logger = logging.getLogger(__name__)
 R = TypeVar('R', bound='ReadingRecipe')
 
@@ -158,43 +164,40 @@ def read_drive(
             stored = _PanoramaFile(Path(cache), recipe, _is_ready(bag, name))
             streams = {'images': bag.stream(name, stored.panorama)}
             streams |= _other_streams(bag, recipe, want_truth)
-            values = _read(bag, streams, stored, progress)
-            odometry = bag.to_odometry(streams['odometry'], values['odometry'])
-            stamps_ns = np.array(stored.stamps, np.int64) - _by_one_clock(bag, streams, values)
-            covered = odometry.trajectory.covers(stamps_ns, int(recipe.odometry_tolerance_s * 1e9))
-            _require_covered(streams['images'], covered, recipe.odometry_tolerance_s)
-            panoramas: Panoramas = stored.finish(stamps_ns, covered)
-            if imu := streams.get('orientation'):
-                panoramas = _leveled(panoramas, imu, values['orientation'], recipe.panorama.sphere)
+            _collect(bag, streams, stored, progress)
+            wheels = streams['odometry']
+            odometry = bag.to_odometry(wheels, wheels.values)
+            for text in by_one_clock(streams):
+                logger.warning('%s: %s', bag.path, text)
+            panoramas = _covered(streams, stored, odometry.trajectory, recipe)
         except OSError as error:
             raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
-        origin, points = _measured(bag, streams, values, recipe.origin)
-        camera = lever_arm(bag, name, streams['odometry'].topic)
+        origin, points = _measured(bag, streams, recipe.origin)
+        camera = lever_arm(bag, name, wheels.topic)
     for problem in bag.problems:
         logger.warning('%s: %s', path, problem)
     counts = {use: stream.count for use, stream in streams.items()}
-    yaw_rate = to_yaw_rate(values['imu']) if values.get('imu') else None
-    truth = to_trajectory(values['ground_truth']) if values.get('ground_truth') else None
+    yaw_rate = to_yaw_rate(streams['imu'].values) if 'imu' in streams else None
+    truth = to_trajectory(streams['ground_truth'].values) if want_truth else None
     seen = stored.seen
     motion = (odometry, yaw_rate, truth)
     return Run(bag.path.name, panoramas, *motion, points, counts, camera, origin, seen)
 
 
 def _measured(
-    bag: Bag, streams: dict[str, Stream], values: dict[str, StampedValues], origin: Origin | None
+    bag: Bag, streams: dict[str, Stream], origin: Origin | None
 ) -> tuple[Origin | None, Points | None]:
-    """The origin of fixes, and measured points; fixes in `values` become places in its plane."""
-    kinds = {use: bag.topics[stream.topic].kind for use, stream in streams.items()}
-    for use in ('points', 'ground_truth'):
-        if kinds.get(use) == decoding.FIX:
-            origin = origin or values[use][0][1][:2]
-            values[use] = in_plane(values[use], origin)
-    if not values.get('points'):
-        return origin, None
+    """The origin of fixes, and measured points; fixes become places in the plane of the origin."""
     lever = None
-    if kinds['points'] == decoding.FIX:
-        lever = lever_arm(bag, streams['points'].topic, streams['odometry'].topic)
-    return origin, to_points(values['points'], lever or 0j)
+    for use in ('points', 'ground_truth'):
+        stream = streams.get(use)
+        if stream and bag.topics[stream.topic].kind == decoding.FIX:
+            origin = origin or stream.values[0][1][:2]
+            stream.values = in_plane(stream.values, origin)
+            if use == 'points':
+                lever = lever_arm(bag, stream.topic, streams['odometry'].topic)
+    points = to_points(streams['points'].values, lever or 0j) if 'points' in streams else None
+    return origin, points
 
 
 def _is_ready(bag: Bag, topic: str) -> bool:
@@ -214,7 +217,6 @@ class _PanoramaFile:
             masked = CameraConfig(blind_sectors=recipe.camera.blind_sectors)
             self._unwrap = Unwrapper(masked, recipe.panorama)
         self._watch = FrozenWatch() if recipe.distinct else None
-        self.stamps: list[int] = []
         self.repeats = 0
         self._shape: tuple[int, ...] = ()
         self._size = 0, 0
@@ -241,10 +243,9 @@ class _PanoramaFile:
         self._shape = self._shape or image.shape
         return image
 
-    def add(self, stamp_ns: int, image: Image) -> None:
+    def add(self, image: Image) -> None:
         """Append a panorama."""
         self._file.write(np.ascontiguousarray(image).data)
-        self.stamps.append(stamp_ns)
 
     def finish(self, stamps_ns: Stamps, keep: NDArray[np.bool_]) -> PanoramaArray:
         """The panoramas marked in `keep` (N,), moved to the beginning of the file."""
@@ -261,12 +262,12 @@ def _other_streams(bag: Bag, recipe: ReadingRecipe, want_truth: bool) -> dict[st
     topics = recipe.topics
     name = bag.find('odometry', topics.odometry)
     streams = {'odometry': bag.stream(name, decoding.odometry_of)}
-    gyroscopes = [topic for topic in bag.topics.values() if topic.kind == decoding.IMU]
-    if topics.imu or any(topic.count for topic in gyroscopes):
-        streams['imu'] = bag.stream(bag.find('imu', topics.imu), read_yaw_rate)
-        streams['imu'].required = bool(topics.imu)
-    elif gyroscopes:
-        names = ', '.join(topic.name for topic in gyroscopes)
+    silent = [topic.name for topic in bag.topics.values() if topic.kind == decoding.IMU]
+    if bag.has('imu', topics.imu):
+        name = bag.find('imu', topics.imu)
+        streams['imu'] = bag.stream(name, read_yaw_rate, required=bool(topics.imu))
+    elif silent:
+        names = ', '.join(silent)
         logger.warning('%s: no message on %s: continuing without gyroscope', bag.path, names)
     if recipe.camera.level_by_imu:
         streams['orientation'] = bag.stream(bag.find('imu', topics.imu), read_tilt)
@@ -279,55 +280,35 @@ def _other_streams(bag: Bag, recipe: ReadingRecipe, want_truth: bool) -> dict[st
     return streams
 
 
-def _read(
-    bag: Bag, streams: dict[str, Stream], stored: _PanoramaFile, progress: bool
-) -> dict[str, StampedValues]:
-    """Store the images; return the values of the other streams by their use. Raises BagError for
-    the images of a frozen camera.
+def _collect(bag: Bag, streams: dict[str, Stream], stored: _PanoramaFile, progress: bool) -> None:
+    """Store the images, and read the values of all streams. Raises BagError for the images of a
+    frozen camera.
     """
-    uses = {id(stream): use for use, stream in streams.items()}
-    values: dict[str, StampedValues] = {use: [] for use in streams}
-    total = bag.topics[streams['images'].topic].count
+    images = streams['images']
+    total = bag.topics[images.topic].count
     with progress_bar(f'read {bag.path.name}', total, visible=progress) as bar:
-        for stream, stamp_ns, value in bag.read(streams.values()):
-            if stream is streams['images']:
-                stored.add(stamp_ns, value)
-                bar.update(stream.received - bar.n)
-            else:
-                values[uses[id(stream)]].append((stamp_ns, value))
-    if text := frozen(stored.repeats, stored.repeats + len(stored.stamps)):
-        raise BagError(f'{bag.path}: {streams["images"].topic}: {text}')
-    return values
+
+        def keep(image: Image) -> None:
+            stored.add(image)
+            bar.update(images.received - bar.n)
+
+        images.keep = keep
+        bag.collect(streams.values())
+    if text := frozen(stored.repeats, stored.repeats + len(images.values)):
+        raise BagError(f'{bag.path}: {images.topic}: {text}')
 
 
-def _by_one_clock(bag: Bag, streams: dict[str, Stream], values: dict[str, StampedValues]) -> int:
-    """Stamp values by the clock of the odometry and log it; return how far images are ahead, ns."""
-    images_ns = 0
-    for use, stream in streams.items():
-        if use in _STAMPED_AT_ONCE:
-            ahead_ns, text = clock_offset(_STAMPED_AT_ONCE[use], stream, streams['odometry'])
-            values[use] = [(stamp_ns - ahead_ns, value) for stamp_ns, value in values[use]]
-            images_ns = ahead_ns if use == 'images' else images_ns
-            if text:
-                logger.warning('%s: %s', bag.path, text)
-    return images_ns
+def _covered(
+    streams: dict[str, Stream], stored: _PanoramaFile, path: Trajectory, recipe: ReadingRecipe
+) -> Panoramas:
+    """The panoramas near the odometry, leveled where that is wanted; the others are counted.
 
-
-def _leveled(panoramas: Panoramas, imu: Stream, tilts: StampedValues, sphere: Sphere) -> Panoramas:
-    """The panoramas as omnicam_node levels them. Raises BagError where none can be leveled."""
-    stamps_ns, measured = (np.array(part) for part in zip(*sorted(tilts), strict=True))
-    image_tilts = tilts_at(panoramas.stamps_ns, stamps_ns, measured)
-    lost = int(np.isnan(image_tilts).any(axis=1).sum())
-    missing = f'{imu.bag}: {imu.topic} has no orientation near {lost} of {len(panoramas)} images'
-    if lost == len(panoramas):
-        raise BagError(f'{missing}: are both stamped by one clock (stamp_source: receive)?')
-    if lost:
-        logger.warning('%s: these are not leveled', missing)
-    return LeveledPanoramas.of(panoramas, np.nan_to_num(image_tilts), sphere)
-
-
-def _require_covered(images: Stream, covered: NDArray[np.bool_], near_s: float) -> None:
-    """Count the images without odometry. Raises BagError where no image has odometry."""
+    Raises BagError where no image has odometry, and where none can be leveled.
+    """
+    images = streams['images']
+    near_s = recipe.odometry_tolerance_s
+    stamps_ns = stamps_of(images.values)
+    covered = path.covers(stamps_ns, int(near_s * 1e9))
     lost = int(np.count_nonzero(~covered))
     near = f'within {near_s:g} s' if near_s else 'before and after'
     if lost:
@@ -338,6 +319,22 @@ def _require_covered(images: Stream, covered: NDArray[np.bool_], near_s: float) 
             f'{images.bag}: none of {lost} images of {images.topic} has odometry {near}; '
             'are both stamped by one clock (stamp_source: receive)?'
         )
+    panoramas = stored.finish(stamps_ns, covered)
+    imu = streams.get('orientation')
+    return _leveled(panoramas, imu, recipe.panorama.sphere) if imu else panoramas
+
+
+def _leveled(panoramas: Panoramas, imu: Stream, sphere: Sphere) -> Panoramas:
+    """The panoramas as omnicam_node levels them. Raises BagError where none can be leveled."""
+    measured = np.array([tilt for _, tilt in imu.values])
+    image_tilts = tilts_at(panoramas.stamps_ns, stamps_of(imu.values), measured)
+    lost = int(np.isnan(image_tilts).any(axis=1).sum())
+    missing = f'{imu.bag}: {imu.topic} has no orientation near {lost} of {len(panoramas)} images'
+    if lost == len(panoramas):
+        raise BagError(f'{missing}: are both stamped by one clock (stamp_source: receive)?')
+    if lost:
+        logger.warning('%s: these are not leveled', missing)
+    return LeveledPanoramas.of(panoramas, np.nan_to_num(image_tilts), sphere)
 
 
 def images_at(bag: Path, stamps_ns: Collection[int], recipe: ReadingRecipe) -> dict[int, Image]:

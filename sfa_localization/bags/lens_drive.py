@@ -10,6 +10,7 @@ import numpy as np
 
 from sfa_localization.bags import decoding
 from sfa_localization.bags.drives import ReadingRecipe
+from sfa_localization.bags.motion_arrays import stamps_of
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.topic_stream import clock_offset
 from sfa_localization.camera.learned_lens import LearnedLens, learn_lens
@@ -51,16 +52,10 @@ def _stamps(bag: Path, recipe: ReadingRecipe) -> tuple[Stamps, Trajectory]:
         images = opened.stamps(opened.find('image', recipe.topics.image))
         name = opened.find('odometry', recipe.topics.odometry)
         odometry = opened.stream(name, decoding.odometry_of)
-        stamps = list[int]()
-        values = list[tuple[int, object]]()
-        for stream, stamp_ns, value in opened.read([images, odometry]):
-            if stream is images:
-                stamps.append(stamp_ns)
-            else:
-                values.append((stamp_ns, value))
-        path = opened.to_odometry(odometry, values).trajectory
+        opened.collect([images, odometry])
+        path = opened.to_odometry(odometry, odometry.values).trajectory
         ahead_ns, _ = clock_offset('images', images, odometry)
-        return np.array(stamps, np.int64), Trajectory(path.stamps_ns + ahead_ns, path.poses)
+        return stamps_of(images.values), Trajectory(path.stamps_ns + ahead_ns, path.poses)
 
 
 def _samples(bag: Path, recipe: ReadingRecipe, stamps_ns: Stamps) -> list[Image]:

@@ -27,21 +27,27 @@ from sfa_localization.data.run import (
 StampedValues = list[tuple[int, Any]]
 """Stamps in ns, each with the value of its message."""
 _DRIVING_MPS = 0.01  # above the noise of wheel encoders at rest
+_UNKNOWN = (0.0, 0.0, 0.0, 0.0)  # twist and variances of messages that have only poses
 
 
-def _stamps(values: StampedValues) -> Stamps:
+def stamps_of(values: StampedValues) -> Stamps:
+    """The stamps (N,) of values."""
     return np.array([stamp for stamp, _ in values], np.int64)
 
 
 def to_trajectory(values: StampedValues) -> Trajectory:
     """Poses at stamps."""
-    return Trajectory(_stamps(values), np.array([pose for _, pose in values], float).reshape(-1, 3))
+    return Trajectory(
+        stamps_of(values), np.array([pose for _, pose in values], float).reshape(-1, 3)
+    )
 
 
-def to_yaw_rate(values: StampedValues) -> YawRate:
-    """Yaw rates at stamps; the values are omega and its variance."""
-    rates = np.array([rate for _, rate in values], float).reshape(-1, 2)
-    return YawRate(_stamps(values), rates[:, 0], rates[:, 1])
+def to_yaw_rate(values: StampedValues) -> YawRate | None:
+    """Yaw rates at stamps, None without any; the values are omega and its variance."""
+    if not values:
+        return None
+    rates = np.array([rate for _, rate in values], float)
+    return YawRate(stamps_of(values), rates[:, 0], rates[:, 1])
 
 
 def to_points(values: StampedValues, lever: complex = 0j) -> Points:
@@ -61,35 +67,37 @@ def to_odometry(values: StampedValues, topic: str) -> tuple[Odometry, list[str],
     None where messages have only poses: then twists are the differences of poses. Raises DataError
     for two publishers, and where nothing is filled.
     """
-    stamps = _stamps(values)
-    poses = np.array([pose for _, (pose, _) in values], float)
-    poses = poses.reshape(-1, 3)
-    has_twist = bool(values) and values[0][1][1] is not None
-    motion = [twist if has_twist else (0.0,) * 4 for _, (_, twist) in values]
-    rows = np.column_stack([poses, np.array(motion, float).reshape(-1, 4)])
+    stamps = stamps_of(values)
+    motion = [(*pose, *(twist or _UNKNOWN)) for _, (pose, twist) in values]
+    rows = np.array(motion, float).reshape(-1, 7)
     empty = _empty(rows)
     if len(rows) and empty.all():
         raise DataError(f'{topic}: neither poses nor twists are filled')
-    aside = np.zeros(len(rows), bool)
+    aside = _aside(stamps, rows, topic)
+    kept = ~(empty | aside)
+    stamps = stamps[kept]
+    (poses, twists, variances) = np.split(rows[kept], (3, 5), axis=1)
+    if values and values[0][1][1] is None:
+        twists = differences(stamps, poses)
+    odometry, oddity = _filled(Odometry(stamps, poses, twists, variances))
+    counts = {'neither pose nor twist': int(empty.sum()), 'pose beside the path': int(aside.sum())}
+    faults = {reason: count for reason, count in counts.items() if count}
+    said = [f'{n} of {len(rows)} messages left out: {why}' for why, n in faults.items()]
+    return odometry, [*said, oddity] if oddity else said, faults
+
+
+def _aside(stamps: Stamps, rows: Array, topic: str) -> Mask:
+    """Which messages (N, 7) have a pose beside the path. Raises DataError for two publishers."""
     posed = np.flatnonzero(np.isfinite(rows[:, 0]))
     seconds = np.asarray((stamps[posed] - stamps[:1]) * 1e-9, float)
+    aside = np.zeros(len(rows), bool)
     aside[posed], in_turn = beside(seconds, rows[posed, :3], rows[posed, 3:5])
     if in_turn > IN_TURN:
         raise DataError(
             f'two publishers on {topic}: its messages lead along two paths in turn; stop one, or '
             'record each on a topic of its own and choose one with --odom-topic'
         )
-    kept = ~(empty | aside)
-    stamps = stamps[kept]
-    (poses, twists, variances) = np.split(rows[kept], (3, 5), axis=1)
-    if not has_twist:
-        twists = differences(stamps, poses)
-        variances = np.zeros((len(stamps), 2))
-    odometry, oddity = _filled(Odometry(stamps, poses, twists, variances))
-    counts = {'neither pose nor twist': int(empty.sum()), 'pose beside the path': int(aside.sum())}
-    faults = {reason: count for reason, count in counts.items() if count}
-    said = [f'{n} of {len(rows)} messages left out: {why}' for why, n in faults.items()]
-    return odometry, [*said, oddity] if oddity else said, faults
+    return aside
 
 
 def _empty(rows: Array) -> Mask:

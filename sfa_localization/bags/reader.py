@@ -114,6 +114,11 @@ class Bag:
                            f'choose one with {wanted.flag}')  # fmt: skip
         return self._readable(topics[0])
 
+    def has(self, kind: str, topic: str = '') -> bool:
+        """Whether the topic of a `kind` is named, or one of its usual types has messages."""
+        usual = KINDS[kind].usual
+        return bool(topic) or any(t.count and t.kind in usual for t in self.topics.values())
+
     def _named(self, wanted: Kind, name: str) -> str:
         plain, colon, child_frame = name.lstrip('/').partition(':')
         topic = self.topics.get(f'/{plain}') or self.topics.get(plain)
@@ -213,6 +218,11 @@ class Bag:
                 yield from stream.take(stream.images.finish(), receive_ns)
             yield from stream.flush()
             self._check_complete(stream)
+
+    def collect(self, streams: Iterable[Stream]) -> None:
+        """Read the `values` of streams in one pass. Raises BagError as `read` does."""
+        for stream, stamp_ns, value in self.read(streams):
+            stream.values.append((stamp_ns, stream.keep(value)))
 
     def _parts(
         self, stream: Stream, topic: Topic, receive_ns: int, data: bytes

@@ -4,13 +4,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sfa_localization.bags.motion_arrays import StampedValues
 from sfa_localization.camera.video import ImageReader
 from sfa_localization.data.errors import BagError, LocalizationError
 from sfa_localization.data.events import CLOCK_JUMP_NS, CLOCK_RANGE_S, clock_difference, whole_leap
@@ -48,7 +49,8 @@ class Stream:
 
     `convert` makes a value of a message, of its transform to `frame`, or of an image of a `wanted`
     stamp that `images` reads. Messages of an opaque stream are not decoded: their value is None.
-    `strict` raises for a faulty message; a `required` stream must have a usable message.
+    `strict` raises for a faulty message; a `required` stream must have a usable message. A stream
+    that is collected has `values`, of used messages by stamp: what `keep` returns of them.
 
     Messages pass in increasing order of stamp, each when the next one has come. A single stamp that
     is ahead of the next is skipped, as is a jump that the next does not continue; a lasting jump is
@@ -62,11 +64,13 @@ class Stream:
     frame: str | None = None
     images: ImageReader | None = None
     wanted: Callable[[int], bool] = lambda stamp_ns: True
+    keep: Callable[[Any], Any] = lambda value: value
     required: bool = True
     opaque: bool = False
     received: int = 0
     used: int = 0
     skipped: RejectionCounter = field(default_factory=RejectionCounter)
+    values: StampedValues = field(default_factory=list)
     _last: Item | None = None
     _waiting: Item | None = None
     _ahead_ns: list[int] = field(default_factory=list)
@@ -142,6 +146,22 @@ class Stream:
 
 Used = tuple[Stream, int, Any]
 """A stream, with the stamp, ns, and the value of a message."""
+# Uses of topics whose messages are sent when measured, in words.
+_STAMPED_AT_ONCE = {'images': 'images', 'imu': 'gyroscope', 'orientation': 'orientation',
+                    'ground_truth': 'ground truth'}  # fmt: skip
+
+
+def by_one_clock(streams: Mapping[str, Stream]) -> list[str]:
+    """Stamp the values of streams, by their use, by the clock of the odometry; return sentences
+    about what was corrected.
+    """
+    texts = []
+    for use, name in _STAMPED_AT_ONCE.items():
+        if stream := streams.get(use):
+            ahead_ns, text = clock_offset(name, stream, streams['odometry'])
+            stream.values = [(stamp_ns - ahead_ns, value) for stamp_ns, value in stream.values]
+            texts.append(text)
+    return [text for text in texts if text]
 
 
 def clock_offset(name: str, stream: Stream, odometry: Stream) -> tuple[int, str]:

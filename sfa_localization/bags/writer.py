@@ -78,12 +78,11 @@ class BagWriter:
         image: Image,
         frame_id: str,
         compressed: str | None = None,
-        quality: int = 90,
     ) -> None:
         """Write a BGR image (H, W, 3) as Image, or as CompressedImage ('jpeg' or 'png')."""
         if compressed is not None:
             message = self._stamped('sensor_msgs/msg/CompressedImage', stamp_ns, frame_id)
-            data = encode_jpeg(image, quality) if compressed == 'jpeg' else encode_png(image)
+            data = encode_jpeg(image) if compressed == 'jpeg' else encode_png(image)
             message.format = compressed
             message.data = np.frombuffer(data, np.uint8)
         else:

@@ -19,6 +19,7 @@ from scipy.ndimage import map_coordinates
 from sfa_localization.camera.calibration_files import CALIBRATION_TITLE, read_calibration
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper, panorama_rays
+from sfa_localization.camera.point_tracks import mean_and_change
 from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.files import first_bytes
@@ -64,14 +65,14 @@ class MirrorCircles:
     hole: Circle | None
 
 
-def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
+def find_circles(images: Sequence[Image]) -> MirrorCircles:
     """Find the rim of the mirror, and its hole, in images (H, W, 3) of one size.
 
     Just outside of the rim the image is dark or, in several images taken while driving, does not
     change; the cue with the clearer circle counts. The same holds just inside of the hole. Raises
     CameraError when no circle stands out.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     scale = min(_SEARCHED_PX / max(images[0].shape), 1.0)
     cues = _cues(images, scale)
 
@@ -99,21 +100,16 @@ def _enlarged(circle: Circle, scale: float) -> Circle:
 
 def _cues(images: Sequence[Image], scale: float) -> list[Array]:
     """Brightness and, of enough images, change (h, w), 0..255: the mirror differs in them."""
-    sums = squares = np.zeros(0)
-    for number, image in enumerate(images):
+    grays = list[Array]()
+    for number, image in enumerate(images, 1):
         gray = _scaled(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), scale)
-        gray = np.asarray(cv2.GaussianBlur(gray, (0, 0), 1.0), float)
-        if number and gray.shape != sums.shape:
+        grays.append(np.asarray(cv2.GaussianBlur(gray, (0, 0), 1.0), float))
+        if gray.shape != grays[0].shape:
             raise CameraError(
-                f'image {number + 1} differs in size from the first: give images of one camera'
+                f'image {number} differs in size from the first: give images of one camera'
             )
-        sums, squares = (sums + gray, squares + gray**2) if number else (gray, gray**2)
-    brightness = sums / len(images)
-    if len(images) < _ENOUGH_FOR_MOTION:
-        return [brightness]
-    variance = squares / len(images) - brightness**2
-    change = cv2.GaussianBlur(np.sqrt(np.maximum(variance, 0)), (0, 0), 2.0)
-    return [brightness, np.asarray(change, float)]
+    brightness, change = mean_and_change(grays)
+    return [brightness] if len(images) < _ENOUGH_FOR_MOTION else [brightness, change]
 
 
 def _scaled(cue: Any, scale: float) -> Array:
@@ -143,34 +139,40 @@ def _find_circle(cue: Array, rng: np.random.Generator, rim: Circle | None) -> Ci
 
 def _coarse_circle(cue: Array, contrast: float, rim: Circle | None, scale: float) -> Array:
     """Column, row, radius at scale 1 of the clearest circle in the cue shrunk by `scale`."""
-    height, width = cue.shape
+    centers, radii = _candidates(cue.shape, rim, scale)
+    hole = rim is not None
+    circles = [_sides(cue, centers, radius, _COARSE_RAYS, hole) for radius in radii]
+    clearness = np.array([_clearness(*sides, contrast) for sides in circles])
+    size, place = np.unravel_index(np.argmax(clearness), clearness.shape)
+    return np.array([*centers[place], radii[size]]) / scale
+
+
+def _candidates(size: tuple[int, ...], rim: Circle | None, scale: float) -> tuple[Array, Array]:
+    """Centers (N, 2) and radii (M,) of circles, in a cue of a size shrunk by `scale`."""
+    height, width = size
     if rim is None:
         middle = np.array([width, height]) / 2
         steps = [np.arange(-0.3, 0.31, _COARSE_STEP / side) * side for side in (width, height)]
-        radii = np.geomspace(0.2 * min(cue.shape), 0.6 * math.hypot(*cue.shape), 40)
+        radii = np.geomspace(0.2 * min(size), 0.6 * math.hypot(*size), 40)
     else:
         middle = np.array([rim.column, rim.row]) * scale
         reach = rim.radius * scale
         steps = [np.linspace(-0.1, 0.1, 7) * reach] * 2
         radii = np.geomspace(max(0.05 * reach, 2.0), 0.6 * reach, 30)
-    centers = middle + np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
-    best = -np.inf
-    circle = np.array([*middle, radii[0]])
-    for radius in radii:
-        bright, dark = _sides(cue, centers, radius, _COARSE_RAYS, rim is not None)
-        visible = np.isfinite(dark).mean(1)
-        kept = visible >= _RIM_SUPPORT
-        if not kept.any():
-            continue
-        bright = bright[kept]
-        dark = dark[kept]
-        level = np.nanmedian(dark, axis=1, keepdims=True) + contrast
-        score = np.mean((bright > level) & (dark < level), 1) - np.mean(dark >= level, 1)
-        score /= visible[kept] + _RIM_SUPPORT  # directions beyond the border do not count
-        if score.max() > best:
-            best = float(score.max())
-            circle = np.array([*centers[kept][np.argmax(score)], radius])
-    return circle / scale
+    return middle + np.stack(np.meshgrid(*steps), -1).reshape(-1, 2), radii
+
+
+def _clearness(bright: Array, dark: Array, contrast: float) -> Array:
+    """How clear circles are (N,) by values (N, rays) on their sides, -inf where hardly visible."""
+    visible = np.isfinite(dark).mean(1)
+    kept = visible >= _RIM_SUPPORT
+    clearness = np.full(len(dark), -np.inf)
+    dark = dark[kept]
+    level = np.nanmedian(dark, axis=1, keepdims=True) + contrast
+    share = np.mean((bright[kept] > level) & (dark < level), 1) - np.mean(dark >= level, 1)
+    # Directions beyond the border do not count.
+    clearness[kept] = share / (visible[kept] + _RIM_SUPPORT)
+    return clearness
 
 
 def _values(cue: Array, points: Complex, order: int) -> Array:

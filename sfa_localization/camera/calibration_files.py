@@ -211,16 +211,9 @@ def _from_others(named: Mapping[str, Any]) -> dict[str, Any]:
     if has_mirror and len(numbers) == 5:
         xi = numbers[:1]
         numbers = numbers[1:]
-    if len(numbers) == 9:
-        numbers = [numbers[0], numbers[4], numbers[2], numbers[5]]
-    numbers = numbers or [_required(named, *names) for names in _FOCAL]
-    if len(numbers) != 4:
-        raise CameraError(f'{len(numbers)} numbers of focal lengths and center, not 4')
-    if numbers[0] == 0.0:
-        raise CameraError('the camera is not calibrated: its focal length is 0')
     fisheye = not has_mirror and bool(kinds & _FISHEYES)
     lens = {
-        **dict(zip(('fx', 'fy', 'cx', 'cy'), numbers, strict=True)),
+        **_focal_and_center(named, numbers),
         **dict(zip(('image_width', 'image_height'), _size(named), strict=True)),
         'distortion': _distortion(named, kinds, fisheye),
     }
@@ -230,6 +223,18 @@ def _from_others(named: Mapping[str, Any]) -> dict[str, Any]:
         return {'camera_model': 'mirror', 'xi': _required({'xi': xi}, 'xi'), **lens}
     # A pinhole camera: not mirrored, and pointed forward.
     return {'camera_model': 'mirror', 'xi': 0.0, 'mirrored': 'no', 'axis': 'forward', **lens}
+
+
+def _focal_and_center(named: Mapping[str, Any], numbers: list[float]) -> dict[str, float]:
+    """Focal lengths and center by the numbers of a matrix or, without any, by their names."""
+    if len(numbers) == 9:
+        numbers = [numbers[0], numbers[4], numbers[2], numbers[5]]
+    numbers = numbers or [_required(named, *names) for names in _FOCAL]
+    if len(numbers) != 4:
+        raise CameraError(f'{len(numbers)} numbers of focal lengths and center, not 4')
+    if numbers[0] == 0.0:
+        raise CameraError('the camera is not calibrated: its focal length is 0')
+    return dict(zip(('fx', 'fy', 'cx', 'cy'), numbers, strict=True))
 
 
 def _distortion(named: Mapping[str, Any], kinds: set[str], fisheye: bool) -> tuple[float, ...]:

@@ -66,6 +66,8 @@ _END = b'\xff\xd9'
 _RESTARTS = range(0xD0, 0xD8)  # markers between parts of a JPEG, numbered in a circle
 _MORE_DATA = bytes(range(1, 65))
 _LARGEST_FILE = 1 << 28  # bytes of an image file
+JPEG_QUALITY = 90
+"""Percent: no visible artifacts, a tenth of the raw size."""
 ENCODINGS = tuple(_LAYOUTS)
 """The encodings that `decode_image` understands, in lower case."""
 
@@ -186,7 +188,7 @@ def read_image(path: Path | str) -> Image:
         raise CameraError(f'{path}: {getattr(error, "strerror", None) or error}') from None
 
 
-def encode_jpeg(image: Image, quality: int) -> bytes:
+def encode_jpeg(image: Image, quality: int = JPEG_QUALITY) -> bytes:
     """Encode a BGR image (H, W, 3) as JPEG of `quality` 1..100."""
     return _encoded('.jpg', image, cv2.IMWRITE_JPEG_QUALITY, int(quality))
 

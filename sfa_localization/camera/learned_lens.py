@@ -29,6 +29,7 @@ from sfa_localization.data.errors import CameraError, LocalizationError
 from sfa_localization.data.geometry import Array, Indices, relative, wrap_angle
 from sfa_localization.data.rig import CAMERA_STD_M, Quantity
 from sfa_localization.data.run import Image, Trajectory, chained
+from sfa_localization.data.sphere import directions
 
 MOTION = {
     'roll': Quantity(0.0, LEAN_STD),
@@ -222,9 +223,8 @@ def visible_elevations(lens: LensCalibration) -> tuple[float, float]:
     camera = make_camera(lens, size, mount_rpy=lens.mount_rpy)
     rows = np.arange(-80.0, 81.0)
     azimuth, elevation = np.meshgrid(np.radians(np.arange(0.0, 360.0, 5.0)), np.radians(rows))
-    level = np.cos(elevation)
-    rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], -1)
-    seen = np.isfinite(camera.project(rays.reshape(-1, 3))[:, 0]).reshape(azimuth.shape)
+    rays = directions(azimuth, elevation).reshape(-1, 3)
+    seen = np.isfinite(camera.project(rays)[:, 0]).reshape(azimuth.shape)
     inside = rows[seen.mean(axis=1) >= _NEARLY_ALL]
     return (float(inside[0]), float(inside[-1])) if inside.size else (0.0, 0.0)
 
@@ -357,24 +357,41 @@ def triangulated(point: Indices, places: Array, rays: Array, passes: int = 3) ->
     centers = np.column_stack([places, np.zeros(len(places))])
     counts = sums(np.ones((len(point), 1)))
     centers = (centers - (sums(centers) / counts)[point]) / _REFERENCE_M
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    column = across @ centers[..., None]
-    corner = np.sum(column * centers[..., None], axis=1, keepdims=True)
-    squares = np.block([[across, -column], [-column.transpose(0, 2, 1), corner]])
+    squares = _squares(centers, rays)
     ahead = sums(rays)
     weight = np.ones((len(point), 1))
     for _ in range(passes):
-        form = sums(weight[..., None] * squares)
-        best = np.linalg.eigh(form)[1][:, :, 0]
-        best *= np.sign(np.sum(best[:, :3] * ahead, axis=1, keepdims=True))
-        behind = best[:, 3] <= 0
-        far = np.linalg.eigh(form[behind, :3, :3])[1][:, :, 0]
-        best[behind, :3] = far * np.sign(np.sum(far * ahead[behind], axis=1, keepdims=True))
-        best[behind, 3] = 0.0
-        directions = best[point, :3] - centers * best[point, 3:]
-        along = np.sum(directions * rays, axis=1, keepdims=True)
-        distance = np.linalg.norm(directions, axis=1, keepdims=True) + 1e-9
-        off = np.linalg.norm(directions - rays * along, axis=1, keepdims=True) / distance
+        best = _homogeneous(sums(weight[..., None] * squares), ahead)
+        toward = best[point, :3] - centers * best[point, 3:]
+        along = np.sum(toward * rays, axis=1, keepdims=True)
+        distance = np.linalg.norm(toward, axis=1, keepdims=True) + 1e-9
+        off = np.linalg.norm(toward - rays * along, axis=1, keepdims=True) / distance
         off += along < 0
         weight = 1 / np.maximum(distance, _NEAREST) ** 2 / (1 + (off / _RAY_RAD) ** 2)
-    return np.asarray(directions / distance)
+    return np.asarray(toward / distance)
+
+
+def _squares(centers: Array, rays: Array) -> Array:
+    """The form (M, 4, 4) of |(I - r r^T) (X - w c)|^2 in (X, w), of rays r from c, both (M, 3)."""
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    column = across @ centers[..., None]
+    corner = np.sum(column * centers[..., None], axis=1, keepdims=True)
+    return np.block([[across, -column], [-column.transpose(0, 2, 1), corner]])
+
+
+def _homogeneous(form: Array, ahead: Array) -> Array:
+    """The points (P, 4), with w >= 0 and on the side of `ahead` (P, 3), that minimize forms
+    (P, 4, 4).
+    """
+    points = _least(form, ahead)
+    behind = points[:, 3] <= 0
+    points[behind, :3] = _least(form[behind, :3, :3], ahead[behind])
+    points[behind, 3] = 0.0
+    return points
+
+
+def _least(form: Array, ahead: Array) -> Array:
+    """The unit vectors (P, K) of the least of forms (P, K, K), on the side of `ahead` (P, 3)."""
+    least = np.linalg.eigh(form)[1][:, :, 0]
+    side = np.sign(np.sum(least[:, :3] * ahead, axis=1, keepdims=True))
+    return np.asarray(least * side)

@@ -14,6 +14,7 @@ from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.geometry import Complex, wrap_angle
 from sfa_localization.data.rig import Quantity
+from sfa_localization.data.sphere import directions
 
 _MARGIN_DEG = 1.0  # inside of what the lens sees: its edge is blurred
 _BELOW_DEG = -3.0  # what lies lower shows by parallax where a robot is
@@ -146,10 +147,8 @@ class _Horizon(NamedTuple):
         azimuth = np.radians(np.arange(0.0, 360.0, 5.0))
 
         def pixels(elevation_deg: float) -> Complex:
-            level = np.cos(np.radians(elevation_deg))
-            up = np.sin(np.radians(elevation_deg))
-            rays = [level * np.cos(azimuth), level * np.sin(azimuth), np.full(len(azimuth), up)]
-            seen = camera.lens.project(np.column_stack(rays) @ camera.rotation)
+            rays = directions(azimuth, np.radians(elevation_deg))
+            seen = camera.lens.project(rays @ camera.rotation)
             scaled = (seen + 0.5) * camera.scale - 0.5
             return np.asarray(scaled[:, 0] + 1j * scaled[:, 1])
 

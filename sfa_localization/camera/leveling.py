@@ -11,6 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -52,10 +53,16 @@ def leveled(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
 def _rotated(panorama: Image, turn: Array, sphere: Sphere) -> Image:
     size = panorama.shape[:2]
     pixels = sphere.pixels(sphere.rays(*size) @ turn.T, *size).astype(np.float32)
-    wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
-    maps = pixels[..., 0] + 1, pixels[..., 1]
-    turned = cv2.remap(wrapped, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    turned = resampled(panorama, pixels[..., 0] + 1, pixels[..., 1])
     return np.asarray(turned, panorama.dtype).reshape(panorama.shape)
+
+
+def resampled(panorama: Any, columns: Any, rows: Any) -> Any:
+    """Values of a panorama (H, W, C) at columns and rows (H, W) float32, counted from one column
+    left of it, as it closes on itself; its upper and lower rows are repeated beyond its edges.
+    """
+    wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
+    return cv2.remap(wrapped, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 @dataclass(frozen=True, slots=True)

@@ -190,9 +190,7 @@ def build_tables(
         pixels = model.lens.project(rays @ model.rotation)
     hidden = _in_sectors(rays, camera.blind_sectors)
     if camera.mask_file:
-        mask = read_mask(camera.mask_file, size)
-        nearest = np.rint(np.nan_to_num(pixels)).astype(int).clip(0, [size[1] - 1, size[0] - 1])
-        hidden |= ~mask[nearest[..., 1], nearest[..., 0]]
+        hidden |= _masked(read_mask(camera.mask_file, size), pixels)
     visible &= ~hidden
     from_rows, from_columns = nearest_visible(~hidden if wraps and visible.any() else visible)
     columns, rows = np.moveaxis(pixels[from_rows, from_columns], -1, 0)
@@ -203,6 +201,13 @@ def build_tables(
     border = cv2.BORDER_WRAP if wraps else cv2.BORDER_REPLICATE
     hides = bool(hidden.any() or (wraps and not visible.all()))
     return _Tables(np.asarray(maps[0]), np.asarray(maps[1]), border, visible, hides)
+
+
+def _masked(mask: Mask, pixels: Array) -> Mask:
+    """Which pixels (H, W, 2), column and row in an image, are not in its mask."""
+    rows, columns = mask.shape
+    nearest = np.rint(np.nan_to_num(pixels)).astype(int).clip(0, [columns - 1, rows - 1])
+    return np.asarray(~mask[nearest[..., 1], nearest[..., 0]])
 
 
 def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:

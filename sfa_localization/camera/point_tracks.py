@@ -74,16 +74,18 @@ class Tracks:
 def changing(samples: Sequence[Image]) -> Mask:
     """Where images (H, W, 3) from all over a drive differ, but for a margin of half a patch."""
     size = samples[0].shape[:2]
-    sums = squares = np.zeros(1)
-    for sample in samples:
-        gray = _gray(sample).astype(float)
-        sums = sums + gray
-        squares = squares + gray**2
-    variance = squares / len(samples) - (sums / len(samples)) ** 2
-    change = cv2.GaussianBlur(np.sqrt(np.maximum(variance, 0.0)), (0, 0), 2.0)
-    still = cv2.dilate((np.asarray(change) < _CHANGE).astype(np.uint8), np.ones((_PATCH, _PATCH)))
+    _, change = mean_and_change([_gray(sample).astype(float) for sample in samples])
+    still = cv2.dilate((change < _CHANGE).astype(np.uint8), np.ones((_PATCH, _PATCH)))
     enlarged = cv2.resize(still, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
     return np.equal(enlarged, 0)
+
+
+def mean_and_change(grays: Sequence[Array]) -> tuple[Array, Array]:
+    """Mean of gray images (H, W), and their standard deviation, smoothed."""
+    mean = np.mean(grays, axis=0)
+    variance = np.mean(np.square(grays), axis=0) - mean**2
+    change = cv2.GaussianBlur(np.sqrt(np.maximum(variance, 0.0)), (0, 0), 2.0)
+    return mean, np.asarray(change, float)
 
 
 def scale_of(size: tuple[int, ...]) -> float:

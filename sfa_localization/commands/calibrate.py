@@ -16,7 +16,7 @@ from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 from sfa_localization.commands import options
 from sfa_localization.data.errors import CameraError, LocalizationError
-from sfa_localization.data.files import atomic_write, require_outputs
+from sfa_localization.data.files import require_outputs, write_bytes
 from sfa_localization.data.run import Image
 
 if TYPE_CHECKING:
@@ -87,13 +87,11 @@ def run(arguments: argparse.Namespace) -> int:
         # Also without --check, to prove that the calibration is usable.
         check = calibration.check_image(images[0], Unwrapper(CameraConfig(), panorama, lens))
         if arguments.check:
-            with atomic_write(arguments.check, CameraError) as file:
-                file.write(encode_png(check))
+            write_bytes(arguments.check, encode_png(check), CameraError)
     elif arguments.check:
         raise LocalizationError('--check needs an image of the camera to draw in')
     if arguments.output:
-        with atomic_write(arguments.output, CameraError) as file:
-            file.write(text.encode())
+        write_bytes(arguments.output, text.encode(), CameraError)
     print(text, end='')
     return 0
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from sfa_localization import __version__
 from sfa_localization.data.errors import LocalizationError
-from sfa_localization.data.files import atomic_write
+from sfa_localization.data.files import write_bytes
 
 if TYPE_CHECKING:
     from sfa_localization.commands.live_nodes import Live
@@ -85,8 +85,7 @@ def prepare_folder(out: Path, world: int) -> None:
             (out / name).unlink(missing_ok=True)
     except OSError as error:
         raise LocalizationError(f'{out}: cannot be written: {error.strerror}') from None
-    with atomic_write(marker) as file:
-        file.write(text.encode())
+    write_bytes(marker, text.encode())
 
 
 def _compare(trained: Trained, live: Live, out: Path, recipe: Recipe) -> Evaluation:

@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
+from operator import itemgetter
 from pathlib import Path
 from subprocess import DEVNULL, STDOUT, Popen, TimeoutExpired
 from typing import NamedTuple
@@ -26,6 +27,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
+from sfa_localization.bags.motion_arrays import to_trajectory
 from sfa_localization.data.errors import NodeError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Trajectory
@@ -109,9 +111,7 @@ class Recorder:
 
     def trajectory(self, name: str) -> Trajectory:
         """The poses that a node published, in order of their stamps."""
-        poses = sorted(self.poses[name], key=lambda item: item[0])
-        stamps = np.array([stamp for stamp, _ in poses], np.int64)
-        return Trajectory(stamps, np.array([pose for _, pose in poses]).reshape(-1, 3))
+        return to_trajectory(sorted(self.poses[name], key=itemgetter(0)))
 
 
 class Processes:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sfa_localization.commands import options
-from sfa_localization.data.files import atomic_write
+from sfa_localization.data.files import write_bytes
 from sfa_localization.mapping.settings import GroundConfig
 
 WRITES = 'MAP.yaml and MAP.pgm, which nav2_map_server reads'
@@ -51,9 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     (height, width) = cells.driven.shape
     (x, y) = cells.corner
     gray = np.where(cells.driven[::-1], _FREE, _UNKNOWN).astype(np.uint8)
-    with atomic_write(image) as file:
-        file.write(f'P5\n{width} {height}\n255\n'.encode() + gray.tobytes())
-    with atomic_write(output) as file:
-        file.write(_YAML.format(image=image.name, cell=config.cell, x=x, y=y).encode())
+    write_bytes(image, f'P5\n{width} {height}\n255\n'.encode() + gray.tobytes())
+    write_bytes(output, _YAML.format(image=image.name, cell=config.cell, x=x, y=y).encode())
     print(f'{output}, {image}: written; the robot drove on {cells.area_m2:.0f} m2')
     return 0

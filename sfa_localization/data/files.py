@@ -95,10 +95,17 @@ def atomic_write(
             Path(temporary).unlink(missing_ok=True)
 
 
+def write_bytes(
+    path: Path, content: bytes, error: type[LocalizationError] = LocalizationError
+) -> None:
+    """Write a file as `atomic_write` does."""
+    with atomic_write(path, error) as file:
+        file.write(content)
+
+
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON, completely or not at all. Raises LocalizationError."""
-    with atomic_write(path) as file:
-        file.write(f'{json.dumps(content, indent=2)}\n'.encode())
+    write_bytes(path, f'{json.dumps(content, indent=2)}\n'.encode())
 
 
 def replaced_mode(path: Path) -> int:

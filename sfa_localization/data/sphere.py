@@ -22,6 +22,13 @@ def rotation(roll: float, pitch: float, yaw: float = 0.0) -> Array:
     return np.asarray(about_z @ about_y @ about_x)
 
 
+def directions(azimuth: Array | float, elevation: Array | float) -> Array:
+    """Unit rays (..., 3), x forward, y left, z up, of azimuths and elevations (...) rad."""
+    level = np.cos(elevation)
+    parts = level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)
+    return np.stack(np.broadcast_arrays(*parts), axis=-1)
+
+
 @dataclass(frozen=True, slots=True)
 class Sphere:
     """The directions of a panorama: all azimuths, forward in the center column.
@@ -57,9 +64,7 @@ class Sphere:
         column, row = np.moveaxis(pixels, -1, 0)
         azimuth = ((column + 0.5) / columns - 0.5) * 2 * np.pi * (-1 if self.clockwise else 1)
         elevation = self.high - (row + 0.5) / rows * (self.high - self.low)
-        level = np.cos(elevation)
-        parts = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
-        return np.stack(parts, axis=-1)
+        return directions(azimuth, elevation)
 
     def rays(self, rows: int, columns: int) -> Array:
         """Unit rays (rows, columns, 3) of the pixels, x forward, y left, z up; read-only."""

@@ -10,7 +10,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs import msg as geometry
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import JumpThreshold, TimeJump
@@ -29,7 +29,14 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import uncertainty
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.discovery import Discovery
-from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, sensor_qos
+from sfa_localization.nodes.lifecycle import (
+    ERROR,
+    OK,
+    WARN,
+    LocalizationNode,
+    latched_qos,
+    sensor_qos,
+)
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.saved_pose import SAVE_PERIOD_S, SavedPose, load_pose, save_pose
 from sfa_localization.nodes.settings import EkfNodeConfig
@@ -43,10 +50,7 @@ try:
 except ImportError:  # without Nav2 nobody calls it
     SetInitialPose = None
 
-_OK = DiagnosticStatus.OK
-_WARN = DiagnosticStatus.WARN
-_ERROR = DiagnosticStatus.ERROR
-_LEVELS = dict(zip(Level, (_WARN, _OK, _WARN, _ERROR), strict=True))
+_LEVELS = dict(zip(Level, (WARN, OK, WARN, ERROR), strict=True))
 PATH_PERIOD_S = 0.5
 PATH_LENGTH = 2000
 """Time between the poses of ekf/path, and their largest number: 17 minutes."""
@@ -216,12 +220,10 @@ class EkfNode(LocalizationNode):
             raise MessageError(f'frame is {frame!r}, not {self._config.map_frame!r}')
         return convert.read_pose(message)
 
-    def _reset(self, _: Any, response: Any) -> Any:
+    def _reset(self, _: Any) -> str:
         self._forget()
         self._publish_state()
-        response.success = True
-        response.message = self.status().level.name
-        return response
+        return self.status().level.name
 
     def _forget_pose(self, _: Any) -> None:
         self.filter.forget_pose()
@@ -229,12 +231,10 @@ class EkfNode(LocalizationNode):
         self.get_logger().info('pose forgotten: images show where the robot is')
         self._publish_state()
 
-    def _pause(self, request: Any, response: Any) -> Any:
+    def _pause(self, request: Any) -> str:
         self._paused = bool(request.data)
         self._publish_state()
-        response.success = True
-        response.message = 'images are not fused' if self._paused else 'images are fused'
-        return response
+        return 'images are not fused' if self._paused else 'images are fused'
 
     def _clock_jumped(self, jump: TimeJump) -> None:
         self.get_logger().warning(
@@ -298,7 +298,7 @@ class EkfNode(LocalizationNode):
 
     def _publish_verdict(self, update: Update) -> None:
         """Publish whether a measurement was accepted: its d2, and the gate's threshold."""
-        level = _OK if update.accepted else _WARN
+        level = OK if update.accepted else WARN
         values = {'accepted': str(update.accepted).lower()}
         for name, value in (('d2', update.d2), ('threshold', update.threshold)):
             values[name] = f'{value:.6g}' if math.isfinite(value) else ''

@@ -46,6 +46,9 @@ TWIN_S = 30.0
 """Longer than DDS takes to forget a node that was killed."""
 _WAKE_PERIOD_S = 0.5  # a signal just before the executor waits does not always wake it
 S = TypeVar('S', bound=Settings)
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN
+ERROR = DiagnosticStatus.ERROR
 _SUCCESS = TransitionCallbackReturn.SUCCESS
 _FAILURE = TransitionCallbackReturn.FAILURE
 
@@ -100,7 +103,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         """Diagnostic level, one line, and further values."""
-        return DiagnosticStatus.OK, 'running', {}
+        return OK, 'running', {}
 
     def find_files(self, words: Sequence[str]) -> None:
         """Find files that the parameter file names, by the words of the command line."""
@@ -203,12 +206,17 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     def is_remapped(self, topic: str) -> bool:
         return self.resolve_topic_name(topic) != self.resolve_topic_name(topic, only_expand=True)
 
-    def service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
-        """A service with the fields success and message, which tells why `callback` failed."""
+    def service(self, kind: Any, name: str, callback: Callable[[Any], str | None]) -> None:
+        """A service with the fields success and message: what `callback` returns, or why it failed.
+        Without a message, as where an answer has no fields, it is empty.
+        """
 
         def answer(request: Any, response: Any) -> Any:
             try:
-                return callback(request, response)
+                message = callback(request)
+                if message is not None:
+                    response.success = True
+                    response.message = message
             except LocalizationError as error:
                 response.message = str(error)
             except Exception as error:
@@ -221,14 +229,13 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     def order(self, kind: Any, name: str, callback: Callable[[Any], None]) -> None:
         """A service with an empty answer: a request is counted, and rejected, as a message is."""
 
-        def answer(request: Any, response: Any) -> Any:
+        def take(request: Any) -> None:
             if self.active:
                 self.take(name, callback, request)
             else:
                 self.refuse(name, 'this node is not active')
-            return response
 
-        self.service(kind, name, answer)
+        self.service(kind, name, take)
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call at a steady period: simulated time may stop, and wall time may step back."""
@@ -346,7 +353,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         if is_simulated and not stamp.nanoseconds and not patient:
             problem = 'use_sim_time is true, but there is no time on /clock: play bags with --clock'
             self.refuse('/clock', problem)
-            level = max(level, DiagnosticStatus.WARN)
+            level = max(level, WARN)
             text = f'{problem}; {text}'
         for topic, monitor in self.monitors.items():
             values.update(monitor.values(f'{self.full_name(topic)}: '))

@@ -13,13 +13,13 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import CameraInfo, CompressedImage, Imu
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import String
 
 from sfa_localization.camera.calibration_files import calibration_of_info
 from sfa_localization.camera.capture import Feed, FeedStatus, opener
+from sfa_localization.camera.encodings import JPEG_QUALITY
 from sfa_localization.camera.leveling import leveled, tilts_at
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.rim_watch import RimWatch
@@ -38,6 +38,7 @@ from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes import lifecycle
 from sfa_localization.nodes.discovery import Discovery, without_transport
 from sfa_localization.nodes.image_input import ImageInput
+from sfa_localization.nodes.lifecycle import ERROR, OK, WARN
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import OmnicamNodeConfig
@@ -49,10 +50,6 @@ _LITTLE_VISIBLE = 0.5  # a smaller visible share of the panorama gives a warning
 _IMU = 'imu/data'
 _ORIENTATIONS = 500
 _CAMERA_INFO = 'camera_info'
-_JPEG_QUALITY = 90  # percent: no visible artifacts, a tenth of the raw size
-_OK = DiagnosticStatus.OK
-_WARN = DiagnosticStatus.WARN
-_ERROR = DiagnosticStatus.ERROR
 
 
 class OmnicamNode(lifecycle.LocalizationNode):
@@ -263,7 +260,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         if self._panoramas.get_subscription_count():
             self._panoramas.publish(convert.to_image(panorama, stamp_ns, frame))
         if self._compressed.get_subscription_count():
-            compressed = convert.to_compressed(panorama, stamp_ns, frame, _JPEG_QUALITY)
+            compressed = convert.to_compressed(panorama, stamp_ns, frame, JPEG_QUALITY)
             self._compressed.publish(compressed)
         self._frozen.add(image)
         if self._rim is not None:
@@ -304,34 +301,34 @@ class OmnicamNode(lifecycle.LocalizationNode):
             details['source'] = status.state
             details['source lost'] = str(status.lost)
             if status.state == 'lost':
-                return _ERROR, f'camera lost, will be opened again: {status.problem}'
+                return ERROR, f'camera lost, will be opened again: {status.problem}'
             if status.state == 'opening':
-                return _WARN, 'opening the camera'
-            return _OK, 'at the end of the images' if status.state == 'ended' else ''
+                return WARN, 'opening the camera'
+            return OK, 'at the end of the images' if status.state == 'ended' else ''
         if self._listening_since_s is None:
-            return _OK, 'idle: nobody listens to the panorama'
+            return OK, 'idle: nobody listens to the panorama'
         listening_s = steady_s() - self._listening_since_s
         silent_s = min(self.monitors[self._input].silent_for_s(), listening_s)
         if silent_s > self.settings(CaptureConfig).silence_timeout:
             silent = f'no image on {self.full_name(self._input)} for {silent_s:.0f} s'
-            return _ERROR, (self.discovery and self.discovery.hint) or silent
-        return _OK, ''
+            return ERROR, (self.discovery and self.discovery.hint) or silent
+        return OK, ''
 
     def _judge_images(self, details: dict[str, str]) -> tuple[int, str]:
         frozen_s = self._frozen.frozen_for_s()
         monitor = self.monitors[self._input]
         if frozen_s:
-            return _WARN, f'the camera has repeated its last image for {frozen_s:.0f} s'
+            return WARN, f'the camera has repeated its last image for {frozen_s:.0f} s'
         if monitor.received and not monitor.used:
-            return _ERROR, 'no image could be used so far'
+            return ERROR, 'no image could be used so far'
         visible = 1.0 if self._size is None else self._unwrapper.visible(self._size).mean()
         details['panorama visible [%]'] = f'{100 * visible:.0f}'
         if visible < _LITTLE_VISIBLE:
-            return _WARN, f'the camera sees only {100 * visible:.0f} % of the panorama'
+            return WARN, f'the camera sees only {100 * visible:.0f} % of the panorama'
         if self._rim is not None and self._rim.problem:
-            return _WARN, self._rim.problem
+            return WARN, self._rim.problem
         if not self._is_level:
             topic = self.full_name(_IMU)
             missing = f'no orientation on {topic} near images: panoramas are not leveled'
-            return _WARN, '; '.join(filter(None, (missing, self._imus.hint)))
-        return _OK, ''
+            return WARN, '; '.join(filter(None, (missing, self._imus.hint)))
+        return OK, ''

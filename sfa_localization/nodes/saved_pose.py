@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.files import atomic_write, read_regular
+from sfa_localization.data.files import read_regular, write_bytes
 from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.inputs import read_pose
 
@@ -46,8 +46,7 @@ def save_pose(path: Path, saved: SavedPose) -> None:
     """
     _content(path)
     content = {'version': _VERSION, **saved._asdict()}
-    with atomic_write(path) as file:
-        file.write((json.dumps(content, default=np.ndarray.tolist) + '\n').encode())
+    write_bytes(path, (json.dumps(content, default=np.ndarray.tolist) + '\n').encode())
 
 
 def load_pose(path: Path, frame: str) -> SavedPose | None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, QuaternionStamped
 from nav_msgs.msg import OccupancyGrid
 from std_msgs.msg import Float64MultiArray, String
@@ -33,7 +32,13 @@ from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.discovery import Discovery
 from sfa_localization.nodes.image_input import ImageInput
-from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos
+from sfa_localization.nodes.lifecycle import (
+    ERROR,
+    OK,
+    WARN,
+    LocalizationNode,
+    latched_qos,
+)
 from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import SfaNodeConfig
 from sfa_localization.observer import Observation, Observer
@@ -41,9 +46,6 @@ from sfa_localization.place_model import PlaceModel
 
 _FEATURE_FRAME = 'slow_feature_space'
 _TURNED_FRAME = 'first_image'
-_OK = DiagnosticStatus.OK
-_WARN = DiagnosticStatus.WARN
-_ERROR = DiagnosticStatus.ERROR
 
 
 class SfaNode(LocalizationNode):
@@ -118,11 +120,9 @@ class SfaNode(LocalizationNode):
             self._observer.use(model)
             self._publish_map()
 
-    def _reload(self, _: Any, response: Any) -> Any:
+    def _reload(self, _: Any) -> str:
         self._use(self._load(self._config.model))
-        response.success = True
-        response.message = f'loaded {self._config.model}'
-        return response
+        return f'loaded {self._config.model}'
 
     def _publish_map(self) -> None:
         """Publish where the robot drove in training, and what ekf_node needs to know."""
@@ -196,18 +196,18 @@ class SfaNode(LocalizationNode):
         topic = self.full_name(self._topic)
         silent = monitor.silent_for_s()
         if math.isinf(silent):
-            return _WARN, self.discovery.hint or f'waiting for images on {topic}', values
+            return WARN, self.discovery.hint or f'waiting for images on {topic}', values
         if silent > self._config.silence_timeout:
-            return _ERROR, f'no image on {topic} for {silent:.0f} s', values
+            return ERROR, f'no image on {topic} for {silent:.0f} s', values
         if problem := self._declared_problem(self._observer.model.panorama):
-            return _ERROR, problem, values
+            return ERROR, problem, values
         if monitor.used == 0:
-            return _ERROR, 'no image has been usable', values
+            return ERROR, 'no image has been usable', values
         if self._last is not None and self._last.problem:
-            return _WARN if self._observer.watch.repeats else _ERROR, self._last.problem, values
+            return WARN if self._observer.watch.repeats else ERROR, self._last.problem, values
         if explained < EXPLAINED_WARNING:
-            return _WARN, 'images are unlike those of training', values
-        return _OK, 'locating', values
+            return WARN, 'images are unlike those of training', values
+        return OK, 'locating', values
 
 
 @lru_cache(maxsize=1)

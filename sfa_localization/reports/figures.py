@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sfa_localization.data.files import atomic_write
+from sfa_localization.data.files import atomic_write, write_bytes
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.rejections import encodable
 from sfa_localization.data.run import Image
@@ -27,16 +27,9 @@ def save(figure: Figure, path: Path) -> None:
         figure.savefig(file, dpi=DOTS_PER_INCH, format='png')
 
 
-def write_picture(path: Path, picture: bytes) -> None:
-    """Write a PNG, completely or not at all. Raises LocalizationError."""
-    with atomic_write(path) as file:
-        file.write(picture)
-
-
 def save_text(path: Path, text: str) -> None:
     """Write a text file, completely or not at all. Raises LocalizationError."""
-    with atomic_write(path) as file:
-        file.write(encodable(text).encode())
+    write_bytes(path, encodable(text).encode())
 
 
 def as_title(text: str) -> str:

@@ -29,7 +29,18 @@ images are almost useless."""
 
 def summary(trained: Trained) -> str:
     """Amount of data, certificate, expected errors, and skipped data, without ground truth."""
-    quality = trained.model.quality
+    lines = [*_map_lines(trained.model.quality), *_drive_lines(trained)]
+    used = {f'{run.name}: {name}': n for run in trained.runs for name, n in run.counts.items()}
+    used['metric learning: images'] = trained.segments.images
+    used['metric learning: odometry'] = trained.segments.odometry
+    for name, count in used.items():
+        lines += [f'{name}: {n} skipped: {why}' for why, n in sorted(count.skipped.items())]
+    grade, verdict = judgment(trained)
+    return '\n'.join(lines if grade == GOOD else [verdict, *lines])
+
+
+def _map_lines(quality: Mapping[str, Any]) -> list[str]:
+    """Amount of data, certificate, and expected errors of one image."""
     coverage = quality['coverage']
     worst = quality['worst']
     along, across = coverage['extent_m']
@@ -48,24 +59,24 @@ def summary(trained: Trained) -> str:
         lines.append(
             f'heading: expect {quality["expected_yaw_error_deg"]:.1f} degrees mean error there'
         )
+    return lines
+
+
+def _drive_lines(trained: Trained) -> list[str]:
+    """Lens, rig and measured points, and what was corrected of each drive."""
+    lines = []
     if trained.lens:
         is_used = trained.lens.calibration == trained.model.lens
         of = 'lens' if is_used else 'lens as the drive shows it, beside the described one in use'
         lines.append(f'{of}: {sentence(trained.lens)}')
-    lines += [*trained.model.rig.as_text(), *point_lines(quality)]
+    lines += [*trained.model.rig.as_text(), *point_lines(trained.model.quality)]
     for run, check in zip(trained.runs, trained.checks, strict=False):
         lines += [f'{run.name}: {text}' for text in check.wrong + check.corrected]
     for run, way in zip(trained.runs, trained.segments.ways, strict=True):
         if way and way.loss.value:
             loss = f'{way.loss.value:.2f} m per radian in turns'
             lines.append(f'{run.name}: wheels lose {loss}: taken into account')
-    used = {f'{run.name}: {name}': n for run in trained.runs for name, n in run.counts.items()}
-    used['metric learning: images'] = trained.segments.images
-    used['metric learning: odometry'] = trained.segments.odometry
-    for name, count in used.items():
-        lines += [f'{name}: {n} skipped: {why}' for why, n in sorted(count.skipped.items())]
-    grade, verdict = judgment(trained)
-    return '\n'.join(lines if grade == GOOD else [verdict, *lines])
+    return lines
 
 
 def judgment(trained: Trained) -> tuple[str, str]:

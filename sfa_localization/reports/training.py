@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from sfa_localization.data.files import write_bytes
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.inspection import InspectionConfig, covered_share, sparse_lanes
@@ -68,7 +69,7 @@ def write_training_report(
     if samples:
         figures.write_worst_images(folder / 'worst_images.png', samples)
     if lens:
-        figures.write_picture(folder / 'lens.png', lens)
+        write_bytes(folder / 'lens.png', lens)
     drawn = {'lens': bool(lens), 'worst_images': bool(samples)}
     names = [name for name in _CAPTIONS if drawn.get(name, True)]
     parts = {name: page.figure(folder / f'{name}.png', _CAPTIONS[name]) for name in names}

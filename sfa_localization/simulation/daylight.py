@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.sphere import directions
 from sfa_localization.simulation.textures import Floats, SkyLook
 
 Color = tuple[float, float, float]
@@ -47,8 +48,7 @@ class Daylight:
         if self.elevation_deg is not None:
             elevation = np.radians(self.elevation_deg)
         azimuth += np.radians(self.turn_deg)
-        level = np.cos(elevation)
-        return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+        return directions(azimuth, elevation)
 
     @property
     def balance(self) -> Floats:

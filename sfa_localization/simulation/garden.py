@@ -15,7 +15,7 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.run import Image
 from sfa_localization.simulation.daylight import LIGHTS
 from sfa_localization.simulation.rendering import Light, Scene, Shape, View
@@ -67,7 +67,11 @@ def panel(
     vertices = origin + i.ravel()[:, None] * right + j.ravel()[:, None] * rise
     a = (np.arange(m)[:, None] * (n + 1) + np.arange(n)).ravel()
     faces = np.concatenate([[a, a + 1, a + n + 2], [a, a + n + 2, a + n + 1]], 1).T
-    normal = np.cross(right, rise)
+    return _flat(vertices, faces, np.cross(right, rise), surface, tint)
+
+
+def _flat(vertices: Array, faces: Indices, normal: Array, surface: str, tint: Tint) -> Shape:
+    """A shape in one plane."""
     normals = np.tile(normal / np.linalg.norm(normal), (len(vertices), 1))
     return Shape(vertices, normals, faces, surface, tint, np.ones(len(vertices)))
 
@@ -219,8 +223,7 @@ def _gable(
         shapes.append(panel(eaves, sign * 1.06 * ahead, slope, 0.6, 'roof', tint))
     for sign in (1.0, -1.0):
         corners = base + sign * ahead / 2 + [-aside / 2, aside / 2, rise]
-        normals = np.tile(sign * ahead / np.linalg.norm(ahead), (3, 1))
-        shapes.append(Shape(corners, normals, np.array([[0, 1, 2]]), *wall, np.ones(3)))
+        shapes.append(_flat(corners, np.array([[0, 1, 2]]), sign * ahead, *wall))
     return shapes
 
 

@@ -18,9 +18,10 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import ArrayLike, NDArray
 
+from sfa_localization.camera.leveling import resampled
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.sphere import rotation
+from sfa_localization.data.sphere import directions, rotation
 from sfa_localization.simulation.daylight import LIGHTS, Daylight
 from sfa_localization.simulation.textures import (
     SKY_COLUMNS,
@@ -86,8 +87,16 @@ class Dome:
         """Rays at falling elevations (R,) and evenly spaced azimuths."""
         azimuth = -(np.arange(columns) + 0.5 - columns / 2) * 2 * np.pi / columns
         e, a = np.meshgrid(elevations_rad, azimuth, indexing='ij')
-        rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1)
-        return cls(elevations_rad, columns, rays.astype(np.float32))
+        return cls(elevations_rad, columns, directions(a, e).astype(np.float32))
+
+    def wrapped_pixels(self, azimuth: Array, elevation: Array) -> tuple[Floats, Floats]:
+        """Columns and rows (N,) of directions (N,) rad, 0 where NaN, in an image of the dome that
+        repeats a column on either side.
+        """
+        column = (0.5 - azimuth / (2 * np.pi)) * self.columns - 0.5 + 1
+        rising = self.elevations_rad[::-1]
+        row = np.interp(elevation, rising, np.arange(len(rising))[::-1])
+        return np.nan_to_num(column).astype(np.float32), np.nan_to_num(row).astype(np.float32)
 
     def turned(self, yaw: float, roll: float = 0.0, pitch: float = 0.0) -> Floats:
         """The rays (rows, columns, 3) in the frame `world`, by yaw, roll and pitch, rad."""
@@ -127,18 +136,13 @@ def raw_view(unproject: Callable[[Array], Array], size: tuple[int, int]) -> View
     azimuth = np.arctan2(rays[:, 1], rays[:, 0])
     elevation = np.arcsin(np.clip(rays[:, 2], -1, 1))
     dome = Dome.build(_rows_for(elevation, config), 2 * config.width)
-    # The dome gets one wrapped column on either side, hence + 1.
-    x = (0.5 - azimuth / (2 * np.pi)) * dome.columns - 0.5 + 1
-    falling = dome.elevations_rad[::-1]
-    y = np.interp(elevation, falling, np.arange(len(falling))[::-1])
-    map_x, map_y = (np.nan_to_num(a).reshape(size).astype(np.float32) for a in (x, y))
-    below = elevation < falling[0] - np.radians(1)
+    map_x, map_y = (part.reshape(size) for part in dome.wrapped_pixels(azimuth, elevation))
+    below = elevation < dome.elevations_rad[-1] - np.radians(1)
     cover = np.where(np.isnan(elevation), 1.0, below).reshape(size).astype(np.float32)
     hull = np.nan_to_num(_hull(azimuth, elevation)).reshape(*size, 3)
 
     def image(dome_image: Floats, gain: Floats) -> Floats:
-        wrapped = np.concatenate([dome_image[:, -1:], dome_image, dome_image[:, :1]], 1)
-        scene = cv2.remap(wrapped, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        scene = resampled(dome_image, map_x, map_y)
         return np.asarray((scene * (1 - cover[..., None]) + hull * cover[..., None]) * gain)
 
     return View(dome, image)
@@ -254,13 +258,9 @@ class Scene:
         values = (
             rows[:, :4] + hits['u'][:, None] * rows[:, 4:8] + hits['v'][:, None] * rows[:, 8:12]
         )
-        normal = hits['Ng']
-        slant = np.abs(np.einsum('ij,ij->i', normal, rays.reshape(-1, 3)))
-        slant /= np.sqrt(np.einsum('ij,ij->i', normal, normal)) + 1e-12
-        footprint = hits['tfar'] * pixel_rad / np.sqrt(slant + 0.01)
-        u = values[:, 0].reshape(shape)
-        v = values[:, 1].reshape(shape)
-        texture = self._atlas.sample(u, v, rows[:, 15].reshape(shape), footprint.reshape(shape))
+        footprint = _footprint(hits, rays, pixel_rad)
+        sampled = (values[:, 0], values[:, 1], rows[:, 15], footprint)
+        texture = self._atlas.sample(*(part.reshape(shape) for part in sampled))
         hour = self._daylight
         sun = np.array(hour.sun, np.float32)
         ambient = np.array(hour.ambient, np.float32)
@@ -274,6 +274,14 @@ class Scene:
         y = (SKY_HIGHEST_DEG - degrees) / (SKY_HIGHEST_DEG - SKY_LOWEST_DEG) * (SKY_ROWS - 1)
         grid = np.asarray(x, np.float32), np.asarray(y, np.float32)
         return np.asarray(cv2.remap(self._sky, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
+
+
+def _footprint(hits: dict[str, NDArray[np.float32]], rays: Floats, pixel_rad: float) -> Floats:
+    """Size (N,) in m of a pixel on the surface that each of N rays hits."""
+    normal = hits['Ng']
+    slant = np.abs(np.einsum('ij,ij->i', normal, rays.reshape(-1, 3)))
+    slant /= np.sqrt(np.einsum('ij,ij->i', normal, normal)) + 1e-12
+    return np.asarray(hits['tfar'] * pixel_rad / np.sqrt(slant + 0.01))
 
 
 def metered(image: Floats, dome: Dome, target: float) -> Floats:
