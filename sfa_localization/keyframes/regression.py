@@ -3,8 +3,8 @@
 """The position of an image among neighboring keyframes: a regression of positions on textures.
 
 Turned to one heading, the textures q_k of N keyframes at places p_k differ by how far things move
-over the panorama, which is about linear in the place over some decimeters. The mean of each drive
-(its light), the likeness to the mean of all, and the changes by roll, pitch and heading are
+over the panorama, which is about linear in the place over some decimeters. The mean of each
+light, the likeness to the mean of all, and the changes by roll, pitch and heading are
 projected out. Another light reduces all differences by one factor, so the image is scaled. With
 A the Gram matrix of the residual textures, a their products with the residual image, and w the
 weights of likeness, ridge regression gives
@@ -84,7 +84,7 @@ def regress(
     image: Spectra,
     keyframes: Spectra,
     places: Array,
-    drives: NDArray[np.int32],
+    lights: NDArray[np.int32],
     channels: Sequence[slice],
     columns: int,
 ) -> Fit:
@@ -92,13 +92,13 @@ def regress(
 
     `image` (4, rows, F) is the spectrum of its texture, and of the derivatives of that by roll,
     pitch and a turn, at the heading of the keyframes. Textures have so many `columns`, and their
-    `channels` are rows; keyframes of different `drives` (N,) may differ by their light.
+    `channels` are rows; keyframes may be of several `lights` (N,).
     """
     count = len(keyframes)
     heights = [part.stop - part.start for part in channels]
     spectra = np.concatenate([keyframes, image])
     products = _products(spectra, channels, columns)
-    basis = _Basis.of(products[:, count, :count].sum(axis=0), drives, places)
+    basis = _Basis.of(products[:, count, :count].sum(axis=0), lights, places)
     gains = basis.gains(products)
     scale = np.ones((len(channels), len(spectra)))
     scale[:, count:] /= gains[:, None]
@@ -137,7 +137,7 @@ def _root_weights(frequencies: int, columns: int) -> Texture:
 @dataclass(frozen=True, slots=True)
 class _Basis:
     """What N keyframes are compared with: the shares `mean` (N,) of the mean that is most like the
-    image, and `centered` (N, N), which subtracts from each keyframe the likest mean of its drive;
+    image, and `centered` (N, N), which subtracts from each keyframe the likest mean of its light;
     their `places` (N, 2) m, and their `weight` (N,) in the regression, of sum 1.
     """
 
@@ -147,13 +147,13 @@ class _Basis:
     weight: Array
 
     @classmethod
-    def of(cls, scores: Array, drives: NDArray[np.int32], places: Array) -> _Basis:
+    def of(cls, scores: Array, lights: NDArray[np.int32], places: Array) -> _Basis:
         """By the correlations (N,) of the keyframes with the image, which say how near they are
-        among those of one drive.
+        among those of one light.
         """
-        numbers, drive = np.unique(drives, return_inverse=True)
-        means = _likest(np.where(numbers[:, None] == drives, scores, -np.inf))
-        centered = np.eye(len(drives)) - means[drive]
+        numbers, light = np.unique(lights, return_inverse=True)
+        means = _likest(np.where(numbers[:, None] == lights, scores, -np.inf))
+        centered = np.eye(len(lights)) - means[light]
         return cls(_likest(scores), centered, places, means.mean(axis=0))
 
     def nuisance(self, number: int) -> Array:
@@ -223,7 +223,7 @@ def _regression(products: Array, basis: _Basis) -> _Regression:
 
 
 def _residuals(nuisance: Array, within: Array, products: Array, basis: _Basis) -> Array:
-    """The combinations (N + 1, n) that are keyframes and image without the mean of their drive and
+    """The combinations (N + 1, n) that are keyframes and image without the mean of their light and
     the `nuisance` (1 + M, n), whose products are `within`.
     """
     count = len(basis.mean)
