@@ -241,7 +241,7 @@ def extended(model: PlaceModel, new: Additions, name: str) -> PlaceModel:
         old,
         values=np.concatenate([old.values[rows], values]),
         poses=np.concatenate([old.poses[rows], new.poses]),
-        drives=np.append(old.drives[rows], np.full(len(new), old.drives.max() + 1, np.int32)),
+        lights=np.append(old.lights[rows], np.full(len(new), old.lights.max() + 1, np.int32)),
     )
     updates: list[Any] = [*model.quality.get('updates', ()), {'bag': name, 'images': len(new)}]
     quality = {**model.quality, 'updates': updates}
@@ -256,7 +256,7 @@ def _kept(old: Keyframes, new: Array) -> NDArray[np.int64]:
     """
     added = np.flatnonzero(~old.first)
     surplus = max(len(added) + len(new) - MOST_ADDED, 0)
-    oldest = added[np.argsort(old.drives[added], kind='stable')][: 2 * surplus]
+    oldest = added[np.argsort(old.lights[added], kind='stable')][: 2 * surplus]
     distance_m, _ = cKDTree(new[:, :2]).query(old.poses[oldest, :2])
     removed = oldest[np.argsort(distance_m, kind='stable')[:surplus]]
     return np.asarray(np.delete(np.arange(len(old.poses)), removed), np.int64)

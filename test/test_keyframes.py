@@ -158,7 +158,7 @@ def test_drives_in_the_same_light_get_one_number(lit):
         parts[number] = sunny(parts[number])
     keyframes = keyframes_of(parts, poses, [3, 5, 7])
     numbers = [0, 1, 0] if lit else [0, 0, 0]
-    assert keyframes.drives.tolist() == np.repeat(numbers, len(poses[0])).tolist()
+    assert keyframes.lights.tolist() == np.repeat(numbers, len(poses[0])).tolist()
     assert keyframes.first.all() and keyframes.trained == max(numbers) + 1
     if not lit:
         images = HOME.panoramas(unseen(30), CONFIG)

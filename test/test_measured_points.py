@@ -208,7 +208,7 @@ def test_a_map_lies_in_the_coordinates_of_its_points():
         scale_std = segments.points.settled.scale_std
         assert error < 1.25 * max(by_similarity, rest) + scale_std * HALF_M
         assert abs(scale - 1.0) < 3 * scale_std
-        assert result.certificate.certified
+        assert result.graph.certificate.certified
 
 
 def test_the_wrong_point_is_named_and_missed_by_what_it_is_wrong():

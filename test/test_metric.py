@@ -99,7 +99,7 @@ def test_noiseless_data_gives_no_error(mode):
     assert np.abs(predicted - truth[:, :2]).max() < 1e-9
     missed = result.poses - truth[result.images]
     assert np.abs(missed[:, :2]).max() < 1e-9 and np.abs(wrap_angle(missed[:, 2])).max() < 1e-9
-    assert result.certificate.certified and np.abs(result.residuals).max() < 1e-9
+    assert result.graph.certificate.certified and np.abs(result.residuals).max() < 1e-9
     # A left-out segment that nothing links is held by rounding alone.
     assert result.held_out_error_m < 1e-7
 
@@ -117,7 +117,7 @@ def test_without_ground_truth_it_is_far_better_than_the_odometry():
     reckoned = run.odometry.poses[::10, :2]
     odometry = errors(align(reckoned, true).apply(reckoned), true).mean()
     assert errors(frame.apply(predicted), unseen).mean() < min(0.15, 0.5 * odometry)
-    assert result.certificate.certified
+    assert result.graph.certificate.certified
 
 
 def errors(a, b):
@@ -145,8 +145,8 @@ def test_a_bias_that_changes_every_minute_is_learned():
     segments = join([cut(run.odometry, run.stamps_ns, ANY)], [0])
     result = learn_metric(features, segments, GP)
     yaw_error = wrap_angle(result.poses[:, 2] - in_odometry_frame(run)[result.images, 2])
-    assert result.yaw_bias == pytest.approx(BIASES, abs=4e-4)
-    assert result.certificate.certified and yaw_error.std() < 0.02
+    assert result.graph.poses.bias == pytest.approx(BIASES, abs=4e-4)
+    assert result.graph.certificate.certified and yaw_error.std() < 0.02
 
 
 def test_the_map_is_the_odometry_frame_at_the_start_and_a_start_pose_moves_it():
@@ -192,7 +192,7 @@ def test_two_runs_share_a_map():
     places, truth = result.poses[:, :2], poses[result.images, :2]
     assert errors(align(places, truth).apply(places), truth).mean() < 0.2
     minutes = [np.ptp(run.stamps_ns) / 60e9 for run in runs]
-    assert len(result.yaw_bias) == np.ceil(minutes).sum()
+    assert len(result.graph.poses.bias) == np.ceil(minutes).sum()
     used = np.flatnonzero(assignment(segments, len(poses)) >= 0)
     assert np.array_equal(used, np.sort(result.images))
 

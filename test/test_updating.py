@@ -114,7 +114,7 @@ def test_network_maps_and_first_keyframes_stay_also_in_its_file(tmp_path):
     assert newer.keyframes.first.sum() == first and 'updates' not in model.quality
     newer.save(tmp_path / 'model.npz')
     read = PlaceModel.load(tmp_path / 'model.npz')
-    np.testing.assert_array_equal(read.keyframes.drives, newer.keyframes.drives)
+    np.testing.assert_array_equal(read.keyframes.lights, newer.keyframes.lights)
     assert read.keyframes.trained == newer.keyframes.trained == 1
     assert read.quality['updates'] == [{'bag': 'later', 'images': len(new)}]
     assert usual_explained(read) == pytest.approx(usual_explained(model))

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -99,11 +100,7 @@ class CameraClockFinder:
         self._driven: deque[tuple[int, float]] = deque()
         self._last: tuple[int, float] | None = None
         self._pairs: deque[tuple[int, int, float]] = deque()
-        # By signed factor and delay: cost, its curvature by the delay and by the factor, its slope
-        # by the factor, and of the pairs with turns their number, their size and their residuals.
-        sums = np.zeros((7, len(_SIGNED), len(_GRID)))
-        self._cost, self._power, self._square, self._pull = sums[:4]
-        self._turns, self._size, self._error = sums[4:]
+        self._sums = _Sums(*np.zeros((7, len(_SIGNED), len(_GRID))))
 
     @property
     def clock(self) -> CameraClock:
@@ -153,56 +150,84 @@ class CameraClockFinder:
         seconds = (stamps_ns - start_ns) * 1e-9
         span = (stop_ns - start_ns) * 1e-9
         counted = np.interp(span - _GRID, seconds, yaw) - np.interp(-_GRID, seconds, yaw)
-        driven = _SIGNED * counted
-        signed = np.asarray(wrap_angle(turn - driven)) / _SCALE_RAD
-        residual = np.abs(signed)
-        turning = np.abs(driven) > _TURN_RAD
-        limited = np.minimum(residual, _OUTLIER)
-        near = residual < _OUTLIER
-        for total, new in (
-            (self._cost, limited),
-            # The derivative of a turn by the delay is the difference of the turn rates at its ends.
-            (self._power, near * np.gradient(driven, _STEP_S, axis=1) ** 2),
-            (self._square, near * counted**2),
-            (self._pull, near * signed * _SCALE_RAD * np.sign(_SIGNED) * counted),
-            (self._turns, turning),
-            (self._size, turning * np.abs(driven)),
-            (self._error, turning * limited * _SCALE_RAD),
-        ):
-            total *= self._keep
-            total += new
-        estimate = self._estimate()
-        start = self._start
+        pairs = zip(self._sums, _Sums.of_pair(turn, counted), strict=True)
+        self._sums = _Sums(*(self._keep * total + new for total, new in pairs))
+        estimate = self._sums.estimate()
         if estimate.is_estimated:
-            agrees = abs(estimate.delay_s - start.delay_s) <= SIGNIFICANT_STDS * estimate.std_s
-            if start.assumed and agrees:
-                std_s = min(start.std_s, estimate.std_s)
-                estimate = CameraClock(start.delay_s, std_s, True, estimate.turn_factor)
-            self._estimates.append((last, estimate))
+            self._estimates.append((last, self._at_start(estimate)))
         while len(self._estimates) > 2 and self._estimates[1][0] < last - _REMEMBERED_NS:
             self._estimates.popleft()
 
-    def _estimate(self) -> CameraClock:
+    def _at_start(self, estimate: CameraClock) -> CameraClock:
+        """An estimate with the delay that was assumed at the start, if it agrees with that."""
+        start = self._start
+        differs = abs(estimate.delay_s - start.delay_s) > SIGNIFICANT_STDS * estimate.std_s
+        if differs or not start.assumed:
+            return estimate
+        std_s = min(start.std_s, estimate.std_s)
+        return CameraClock(start.delay_s, std_s, True, estimate.turn_factor)
+
+
+class _Sums(NamedTuple):
+    """Sums over pairs of images, by signed factor and delay (F, D)."""
+
+    cost: Array
+    power: Array
+    """Curvature of the cost by the delay."""
+    square: Array
+    pull: Array
+    """Curvature and slope of the cost by the factor."""
+    turns: Array
+    size: Array
+    error: Array
+    """Of pairs with turns their number, their size, rad, and their residuals, rad."""
+
+    @classmethod
+    def of_pair(cls, turn: float, counted: Array) -> _Sums:
+        """Of one pair with this turn, rad, and that of the odometry by delays (D,)."""
+        driven = _SIGNED * counted
+        signed = np.asarray(wrap_angle(turn - driven)) / _SCALE_RAD
+        residual = np.abs(signed)
+        turning = (np.abs(driven) > _TURN_RAD).astype(float)
+        limited: Array = np.minimum(residual, _OUTLIER)
+        near = residual < _OUTLIER
+        return cls(
+            limited,
+            # The derivative of a turn by the delay is the difference of the turn rates at its ends.
+            near * np.gradient(driven, _STEP_S, axis=1) ** 2,
+            near * counted**2,
+            near * signed * _SCALE_RAD * np.sign(_SIGNED) * counted,
+            turning,
+            turning * np.abs(driven),
+            turning * limited * _SCALE_RAD,
+        )
+
+    def estimate(self) -> CameraClock:
         """The delay of the least cost, unless it lies at the border or the turns do not fix it."""
-        side, best = np.unravel_index(int(np.argmin(self._cost)), self._cost.shape)
-        turns, size, error = (a[side, best] for a in (self._turns, self._size, self._error))
-        if turns < _TURNS_MIN or error > size / 2 or not 0 < best < len(_GRID) - 1:
+        side, best = np.unravel_index(int(np.argmin(self.cost)), self.cost.shape)
+        turns = self.turns[side, best]
+        error = self.error[side, best]
+        is_clear = turns >= _TURNS_MIN and error <= self.size[side, best] / 2
+        if not is_clear or not 0 < best < len(_GRID) - 1:
             return CameraClock()
         scale = max(error / turns / _MEAN_OF_NORMAL, _SCALE_MIN_RAD)
-        std = _CAUTION * scale / np.sqrt(max(self._power[side, best], 1e-12))
+        std = _CAUTION * scale / np.sqrt(max(self.power[side, best], 1e-12))
         # While a robot turns steadily, many delays fit nearly as well as the best.
-        alike = _GRID[self._cost[side] <= self._cost[side, best] + _ALIKE]
+        alike = _GRID[self.cost[side] <= self.cost[side, best] + _ALIKE]
         std = max(std, float(np.ptp(alike)) / 4)
         if std > _STD_MAX_S:
             return CameraClock()
-        below, least, above = self._cost[side, best - 1 : best + 2]
-        # Two slopes meet in the minimum of a sum of absolute values.
-        steepest = max(below - least, above - least)
-        part = (below - above) / (2 * steepest) if steepest > 0 else 0.0
-        square = max(float(self._square[side, best]), 1e-12)
-        factor = abs(float(_SIGNED[side, 0])) + float(self._pull[side, best]) / square
+        delay_s = float(_GRID[best] + _STEP_S * _lowest(*self.cost[side, best - 1 : best + 2]))
+        square = max(float(self.square[side, best]), 1e-12)
+        factor = abs(float(_SIGNED[side, 0])) + float(self.pull[side, best]) / square
         turn_factor = Quantity(factor, float(_CAUTION * scale / np.sqrt(square)))
-        return CameraClock(float(_GRID[best] + part * _STEP_S), float(std), False, turn_factor)
+        return CameraClock(delay_s, float(std), False, turn_factor)
+
+
+def _lowest(below: float, least: float, above: float) -> float:
+    """Where two slopes meet, in the minimum of a sum of absolute values: -0.5 to 0.5 steps."""
+    steepest = max(below - least, above - least)
+    return (below - above) / (2 * steepest) if steepest > 0 else 0.0
 
 
 class ImageClock:

@@ -22,14 +22,15 @@ state does not depend on any of this.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, Complex
 from sfa_localization.fusion.belief import LONGEST_DELAY_S, Columns, DrivenPath, PositionFix
-from sfa_localization.fusion.relocation import AGREEING_M
+from sfa_localization.fusion.relocation import AGREEING_M, aligned, centered, summed
 
 LIKELY = 0.9
 """Least probability of no harmful fault with which the estimate is trusted."""
@@ -64,10 +65,6 @@ _ANYWHERE = 1 / (100.0 * 2 * math.pi)
 """Density of poses anywhere in 100 m^2, 1/(m^2 rad)."""
 _TINY = 1e-9  # least weight of an image, so that some path fits best
 _STEPS = 2  # of reweighting, from where the fit hardly changes
-# rows that have these nuisances
-_LEVER = -3
-_TURNED = -2
-_SCALE = -1
 _AHEAD_S = 0.3  # of the path: odometry may be a little behind
 
 
@@ -165,105 +162,143 @@ class _Window:
 
     def hypotheses(self) -> list[_Hypothesis]:
         """All, with log odds up to a constant."""
-        rows, yaws, delays = self._paths()
-        turned_rows, turned_yaws = self._turned_paths(rows[0], yaws[0])
-        rows = np.concatenate([rows, turned_rows, np.repeat(rows[:1], 3, 0)])
-        yaws = np.concatenate([yaws, turned_yaws, np.repeat(yaws[:1], 3, 0)])
-        off = np.abs(rows[:, -1] - rows[0, -1]) > HARMLESS_M
-        off |= np.abs(yaws[:, -1] - yaws[0, -1]) > HARMLESS_RAD
-        logs, (lever, turned, scale) = self._fitted(rows, yaws)
-        prior = math.log(PRIOR)
-        late_prior = math.log(LATE_PRIOR / len(DELAYS))
-        wheels_prior = math.log(PRIOR / len(FACTORS))
-        as_it_is = math.log(1 - LATE_PRIOR - 5 * PRIOR)
-        unrelated = self._power * len(self._places) * math.log(_ANYWHERE)
-        of_scale = abs(scale - 1) * AGREEING_M > HARMLESS_M
-        late = slice(1, len(delays))
-        wheels = slice(len(delays), len(rows) - 3)
-        of_delays = zip(logs[late] + late_prior, delays[late], off[late], strict=True)
-        turned_lately = float(np.ptp(yaws[0, self._is_recent]))
-        misturned = np.abs(FACTORS - 1) * turned_lately > HARMLESS_RAD
-        of_factors = zip(logs[wheels] + wheels_prior, FACTORS, misturned, strict=True)
+        places, yaws = self._driven(np.zeros(1))
+        well = self._fitted(places, yaws, 1 - LATE_PRIOR - 5 * PRIOR)
+        unrelated = self._power * len(self._places) * math.log(_ANYWHERE) + math.log(PRIOR)
         return [
-            _Hypothesis('as it is', logs[0] + as_it_is, 0j, False),
-            _Hypothesis('lever', logs[_LEVER] + prior, lever, abs(lever) > HARMLESS_M),
-            _Hypothesis('turned', logs[_TURNED] + prior, turned, abs(turned) > HARMLESS_RAD),
-            _Hypothesis('scale', logs[_SCALE] + prior, scale, of_scale),
-            _Hypothesis('unrelated', unrelated + prior, 0j, True),
-            *(_Hypothesis('late', *each) for each in of_delays),
-            *(_Hypothesis('wheels', *each) for each in of_factors),
+            _Hypothesis('as it is', well.log[0], 0j, False),
+            _Hypothesis('unrelated', unrelated, 0j, True),
+            *self._delayed(places, yaws),
+            *self._turned_by_factors(places, yaws),
+            self._with_lever(places, yaws),
+            self._with_turned_camera(places, yaws),
+            self._with_scale(places, yaws),
         ]
 
-    def _paths(self) -> tuple[Complex, Array, Array]:
-        """Places and headings (R, N) on the path by the delays (R,) for which it is long enough."""
-        delays = np.append(0.0, DELAYS)
-        earliest = self._seconds[0] - delays
-        latest = self._seconds[-1] - delays
-        covered = (earliest >= self._times[0]) & (latest <= self._times[-1] + _AHEAD_S)
-        delays = delays[covered | (delays == 0.0)]
+    def _driven(self, delays: Array) -> tuple[Complex, Array]:
+        """Places and headings (R, N) on the path by delays (R,)."""
         at = self._seconds - delays[:, None]
-        places, yaws = (np.interp(at, self._times, x) for x in (self._path, self._path_yaw))
-        return places, yaws, delays
+        return np.interp(at, self._times, self._path), np.interp(at, self._times, self._path_yaw)
 
-    def _turned_paths(self, places: Complex, yaws: Array) -> tuple[Complex, Array]:
-        """Places and headings (R, N) on the path that turns FACTORS (R,) times as far."""
-        beyond = (FACTORS[:, None] - 1.0) * (yaws - yaws[0])
+    def _delayed(self, places: Complex, yaws: Array) -> Iterator[_Hypothesis]:
+        """Of the delays for which the path is long enough."""
+        earliest = self._seconds[0] - DELAYS
+        latest = self._seconds[-1] - DELAYS
+        covered = (earliest >= self._times[0]) & (latest <= self._times[-1] + _AHEAD_S)
+        delays = DELAYS[covered]
+        late_places, late_yaws = self._driven(delays)
+        harmful = np.abs(late_places - places)[:, -1] > HARMLESS_M
+        harmful |= np.abs(late_yaws - yaws)[:, -1] > HARMLESS_RAD
+        fits = self._fitted(late_places, late_yaws, LATE_PRIOR / len(DELAYS))
+        for each in zip(fits.log, delays, harmful, strict=True):
+            yield _Hypothesis('late', *each)
+
+    def _turned_by_factors(self, places: Complex, yaws: Array) -> Iterator[_Hypothesis]:
+        """Of a path that turns FACTORS times as far."""
+        beyond = (FACTORS[:, None] - 1.0) * (yaws - yaws[:, :1])
         between = np.exp(1j * (beyond[:, 1:] + beyond[:, :-1]) / 2)
-        steps = np.cumsum(between * np.diff(places), axis=1)
-        return places[0] + np.insert(steps, 0, 0.0, axis=1), yaws + beyond
+        ways = np.cumsum(between * np.diff(places), axis=1)
+        harmful = np.abs(FACTORS - 1) * np.ptp(yaws[0, self._is_recent]) > HARMLESS_RAD
+        turned_places = np.insert(ways, 0, 0.0, axis=1)
+        fits = self._fitted(turned_places, yaws + beyond, PRIOR / len(FACTORS))
+        for each in zip(fits.log, FACTORS, harmful, strict=True):
+            yield _Hypothesis('wheels', *each)
 
-    def _fitted(self, rows: Complex, yaws: Array) -> tuple[Array, tuple[complex, float, float]]:
-        """Log evidence (R,) of paths, and lever, angle and factor, which the last three have.
+    def _with_lever(self, places: Complex, yaws: Array) -> _Hypothesis:
+        """Of a camera beside its place on the robot."""
+        fit = self._fitted(places, yaws, PRIOR, LEVER_STD_M * np.exp(1j * yaws))
+        lever = LEVER_STD_M * fit.shift.item()
+        return _Hypothesis('lever', fit.log[0], lever, abs(lever) > HARMLESS_M)
 
-        With weights w and w', centered places z and path d, and v = exp(i (yaw - h)), the error
-        sum w |z - u d|^2 + w' |v - u|^2 is least for the u along sum w conj(d) z + w' v.
+    def _with_turned_camera(self, places: Complex, yaws: Array) -> _Hypothesis:
+        """Of headings that are all off by one angle."""
+        fit = self._fitted(places, yaws, PRIOR, angle_std=TURNED_STD_RAD)
+        angle = TURNED_STD_RAD * fit.angle.item()
+        return _Hypothesis('turned', fit.log[0], angle, abs(angle) > HARMLESS_RAD)
+
+    def _with_scale(self, places: Complex, yaws: Array) -> _Hypothesis:
+        """Of images that move farther than the odometry, or less far."""
+        fit = self._fitted(places, yaws, PRIOR, SCALE_STD * places, axes=1)
+        longer = SCALE_STD * fit.shift.item()
+        is_harmful = abs(longer) * AGREEING_M > HARMLESS_M
+        return _Hypothesis('scale', fit.log[0], 1 + longer, is_harmful)
+
+    def _fitted(
+        self,
+        places: Complex,
+        yaws: Array,
+        prior: float,
+        direction: Complex | float = 0.0,
+        axes: int = 2,
+        angle_std: float = 0.0,
+    ) -> _Fits:
+        """Paths of `places` and `yaws` (R, N), each of this prior probability, laid on the images
+        by least squares, repeated with weights that fall with the residuals.
+
+        One nuisance may be open: paths are displaced along a `direction` (R, N), or headings are
+        off by an angle of this standard deviation.
         """
-        arm = np.exp(1j * yaws)
-        ones = np.ones((len(rows), 1))
-        look = self._looks * np.conj(arm)
-        weight = np.ones(rows.shape)
-        lever = 0j * ones
-        angle = 0.0 * ones
-        factor = 1.0 * ones
-        by_yaw = 1.0 * ones
-        by_yaw[_TURNED] = 0.0  # before its angle is estimated
+        looks = self._looks * np.exp(-1j * yaws)
+        share = np.ones(places.shape)
+        displaced = places
+        turned = 0.0 * looks if angle_std else looks  # before the angle is estimated
         for _ in range(_STEPS):
-            w = weight / self._variance
-            w_yaw = weight / self._yaw_variance
-            total, of_yaw = (each.sum(1, keepdims=True) for each in (w, w_yaw))
-            d, g, z = (x - (w * x).sum(1, keepdims=True) / total for x in (rows, arm, self._places))
-            looks = (w_yaw * look).sum(1, keepdims=True)
-            path = factor * d + lever * g
-            u = (w * np.conj(path) * z).sum(1, keepdims=True)
-            u = u + looks * np.exp(-1j * angle) * by_yaw
-            u = u / np.maximum(np.abs(u), _TINY)
-            by_yaw = ones
-            arms = w[_LEVER] * np.conj(g[_LEVER])
-            ways = w[_SCALE] * np.conj(d[_SCALE])
-            of_arm = float((arms @ g[_LEVER]).real) + LEVER_STD_M**-2
-            of_path = float((ways @ d[_SCALE]).real) + SCALE_STD**-2
-            of_angle = float(of_yaw[_TURNED, 0]) + TURNED_STD_RAD**-2
-            lever[_LEVER] = arms @ (z[_LEVER] * np.conj(u[_LEVER]) - d[_LEVER]) / of_arm
-            along = (np.conj(u[_SCALE]) * (ways @ z[_SCALE])).real
-            factor[_SCALE] = (along + SCALE_STD**-2) / of_path
-            turned = np.angle(looks[_TURNED] * np.conj(u[_TURNED]))
-            angle[_TURNED] = turned * of_yaw[_TURNED] / of_angle
-            path = factor * d + lever * g
-            squares = np.abs(z - u * path) ** 2 / self._variance
-            squares += 2 * (1 - (look * np.conj(u * np.exp(1j * angle))).real) / self._yaw_variance
-            fits = self._peak * np.exp(-0.5 * squares)
-            anything = fits + OUTLIERS * _ANYWHERE
-            weight = fits / anything + _TINY
-        square = (w * np.abs(path) ** 2).sum(1) + of_yaw[:, 0] + _TINY
-        log = np.log(anything).sum(1) - np.log(total[:, 0]) - 0.5 * np.log(square)
-        log += math.log(_ANYWHERE * (2 * math.pi) ** 1.5)
-        sizes = complex(lever[_LEVER, 0]), float(angle[_TURNED, 0]), float(factor[_SCALE, 0])
-        log[_LEVER:] -= _unlikely(sizes, (of_arm, of_angle, of_path))
-        return self._power * log, sizes
+            w = share / self._variance
+            w_yaw = share / self._yaw_variance
+            shown, u = aligned(displaced, self._places, turned, w, w_yaw)
+            missed = np.conj(u) * shown - centered(places, w)
+            off = np.angle(np.conj(u) * summed(w_yaw * looks))
+            shift = _Nuisance.along(centered(direction, w), missed, w, axes)
+            angle = _Nuisance.along(angle_std, off, summed(w_yaw), 1)
+            displaced = places + shift.size * direction
+            turned = looks * np.exp(-1j * angle_std * angle.size)
+            density = self._density(shown - u * centered(displaced, w), turned * np.conj(u))
+            share = 1 - OUTLIERS * _ANYWHERE / density + _TINY
+        log = _log_evidence(density, displaced, w, w_yaw) - shift.surplus - angle.surplus
+        log = self._power * log + math.log(prior)
+        return _Fits(log[:, 0], shift.size, angle.size)
+
+    def _density(self, missed: Complex, turned: Complex) -> Array:
+        """Of images (R, N) that lie `missed` from their places, and whose headings are `turned`."""
+        squares = np.abs(missed) ** 2 / self._variance
+        squares += 2 * (1 - turned.real) / self._yaw_variance
+        return np.asarray(self._peak * np.exp(-0.5 * squares) + OUTLIERS * _ANYWHERE)
 
 
-def _unlikely(sizes: tuple[complex, float, float], precision: tuple[float, ...]) -> Array:
-    """Minus the log of the prior density times the posterior width of each nuisance (Laplace)."""
-    stds = np.array([LEVER_STD_M, TURNED_STD_RAD, SCALE_STD])
-    squares = np.abs(np.subtract(sizes, (0, 0, 1)) / stds) ** 2
-    return np.asarray(squares + np.log(precision * stds**2) * [2, 1, 1]) / 2
+def _log_evidence(density: Array, places: Complex, w: Array, w_yaw: Array) -> Array:
+    """Of paths (R, 1), by Laplace's method over their shift and turn."""
+    reach = summed(w * np.abs(centered(places, w)) ** 2 + w_yaw) + _TINY
+    log = summed(np.log(density)) - np.log(summed(w)) - np.log(reach) / 2
+    return np.asarray(log + math.log(_ANYWHERE * (2 * math.pi) ** 1.5))
+
+
+class _Fits(NamedTuple):
+    """Log odds (R,) of paths, and the sizes (R, 1) of their nuisances in units of the priors."""
+
+    log: Array
+    shift: NDArray[Any]
+    angle: NDArray[Any]
+
+
+class _Nuisance(NamedTuple):
+    """Sizes (R, 1), whose prior has unit variance along each of the `axes`: a complex size, or with
+    one axis a real one; and their precision by prior and images."""
+
+    size: NDArray[Any]
+    precision: Array
+    axes: int
+
+    @classmethod
+    def along(
+        cls, direction: Complex | float, missed: NDArray[Any], weight: Array, axes: int
+    ) -> _Nuisance:
+        """The likeliest that explains what is `missed` (R, N) by this `direction` (R, N)."""
+        weighted = weight * np.conj(direction)
+        precision = 1 + summed((weighted * direction).real)
+        size = summed(weighted * missed) / precision
+        return cls(size if axes == 2 else size.real, precision, axes)
+
+    @property
+    def surplus(self) -> Array:
+        """Minus the log of the prior density times the posterior width (Laplace)."""
+        return np.asarray(np.abs(self.size) ** 2 + self.axes * np.log(self.precision)) / 2

@@ -42,10 +42,10 @@ SIZE = 14
 TURN_RADIUS_M = 0.25  # one radian of turning counts as this way: half the track of a small robot
 YAW_PER_METER = 0.005  # rad per sqrt(m): turns that wheels do not show
 ODOMETRY_CORRELATION_S = 0.1  # readings err alike for the time constant of a wheel controller
-BIAS_WALK, SCALE_WALK, LOSS_WALK, TURN_WALK, OFFSET_WALK, DELAY_WALK = 1e-4, *[1e-3] * 3, 1e-4, 1e-3
-"""Random walks: turn-rate bias of a cheap gyroscope, rad/s per sqrt(s); wheel scale, 1/sqrt(m), a
-percent over 100 m; loss in turns, m/rad per sqrt(rad); turn factor, 1/sqrt(rad); offset of the
-speed, m/s per sqrt(s); delay of the camera, s per sqrt(s)."""
+WALKS: Array = np.square([1e-4, 1e-3, 1e-3, 1e-3, 1e-4, 1e-3])
+"""Squares of the random walks of BIAS to DELAY: turn-rate bias of a cheap gyroscope, rad/s per
+sqrt(s); wheel scale, 1/sqrt(m), a percent over 100 m; loss in turns, m/rad per sqrt(rad); turn
+factor, 1/sqrt(rad); offset of the speed, m/s per sqrt(s); delay of the camera, s per sqrt(s)."""
 PRIOR_CHANGE = 1.0
 CHANGES = 100
 """Square of the change of speed (m/s) and turn rate (rad/s) in a second before any is observed,
@@ -145,6 +145,11 @@ class Twist(NamedTuple):
         """Whether a robot of this twist does not stand."""
         return abs(self.v) >= STANDSTILL_SPEED or abs(self.omega) >= STANDSTILL_RATE
 
+    @property
+    def covariance(self) -> Array:
+        """Of v and omega (2, 2)."""
+        return np.diag([self.v_variance, self.omega_variance])
+
 
 class Pace(NamedTuple):
     """Mean squares `v` and `omega` of this robot's changes of speed and turn rate in a second, over
@@ -219,8 +224,7 @@ def drive(
     by_twist = step.jacobian[:BIAS, V:BIAS].copy()
     step.jacobian[:BIAS, V:BIAS] = 0.0
     step.jacobian[:BIAS, BIAS:DELAY] = by_twist @ by_errors
-    variances = np.diag([twist.v_variance, twist.omega_variance])
-    step.noise[:BIAS, :BIAS] += by_twist @ variances @ by_twist.T
+    step.noise[:BIAS, :BIAS] += by_twist @ twist.covariance @ by_twist.T
     if now is not None:
         by_errors = _by_errors(mean, now)
         step.mean[V:BIAS] = now[:2] + by_errors @ mean[BIAS:DELAY]
@@ -284,7 +288,7 @@ def _advance(
     """CTRV at v and omega over dt: mean, full Jacobian, and the noise of driving itself: slip, the
     random walks of BIAS to ERROR, and errors of readings.
     """
-    moved, by_twist = arc(float(mean[YAW]), v, omega, dt)
+    moved, by_twist = arc(mean[YAW], v, omega, dt)
     meters = abs(v) * dt
     radians = abs(omega) * dt
     fade = math.exp(-(meters + TURN_RADIUS_M * radians) / noise.decorrelation_m)
@@ -295,13 +299,12 @@ def _advance(
     jacobian[:3, V:BIAS] = by_twist
     slip = noise.slip_per_meter**2 * meters
     yaw = YAW_PER_METER**2 * meters + noise.yaw_per_radian**2 * radians
-    walks = np.square([BIAS_WALK, SCALE_WALK, LOSS_WALK, TURN_WALK, OFFSET_WALK, DELAY_WALK])
-    walks *= [dt, meters, radians, radians, dt, dt]
+    walks = WALKS * [dt, meters, radians, radians, dt, dt]
     added = np.diag([slip, slip, yaw, 0, 0, *walks, *[1 - fade * fade] * 3])
     # Readings err alike for a while, which does not average out with the rate of the messages: over
     # dt it moves the pose as a constant error of variance (variance * time / dt) would.
     if dt > 0:
-        lasting = ODOMETRY_CORRELATION_S / dt * np.diag([twist.v_variance, twist.omega_variance])
+        lasting = ODOMETRY_CORRELATION_S / dt * twist.covariance
         added[:3, :3] += by_twist @ lasting @ by_twist.T
     return Step(after, jacobian, added)
 

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.geometry import Array, Complex, wrap_angle
 from sfa_localization.fusion.belief import ENOUGH_IMAGES, Belief, Columns, PositionFix
 from sfa_localization.fusion.motion import YAW
 
@@ -77,11 +77,11 @@ def relocate(fixes: Sequence[PositionFix], decorrelation_m: float) -> Relocation
     Only images that the filter rejected count. `decorrelation_m`: see ErrorCorrelation.distance_m.
     """
     rejected = Columns([fix for fix in fixes if not fix.accepted])
-    tried = [(_agreeing(rejected, turn, variance), turn) for turn, variance in _turns(rejected)]
+    tried = [_agreeing(rejected, *turn) for turn in _turns(rejected)]
     if not tried:
         return None
-    agree, turn = max(tried, key=lambda trial: int(trial[0].sum()))
-    best = _fitted(rejected, agree, turn, decorrelation_m)
+    agree = max(tried, key=np.count_nonzero)
+    best = _fitted(rejected, agree, decorrelation_m)
     oldest_m = fixes[-1].traveled_m - best.distance_m
     recent = [fix.accepted for fix in fixes if fix.traveled_m >= oldest_m]
     against = sum(recent)
@@ -117,32 +117,54 @@ def _agreeing(fixes: Columns, turn: float, turn_variance: float) -> NDArray[np.b
     return np.asarray(near & (np.abs(residual) ** 2 <= AGREEING_STDS**2 * variance))
 
 
-def _fitted(
-    fixes: Columns, agree: NDArray[np.bool_], turn: float, decorrelation_m: float
-) -> Relocation:
-    """Weighted least squares over the agreeing images: see health._Window for the solution."""
+def _fitted(fixes: Columns, agree: NDArray[np.bool_], decorrelation_m: float) -> Relocation:
+    """Weighted least squares over the agreeing images."""
     has_yaw = agree & fixes.has_yaw
     weight = agree / (fixes.variance + fixes.drift)
     yaw_weight = has_yaw / (fixes.yaw_variance + fixes.drift)
-    total = weight.sum()
-    middle = (weight @ fixes.place) / total
-    path = fixes.path - (weight @ fixes.path) / total
-    place = fixes.place - middle
-    image_turns = np.exp(1j * (turn + _yaw_residual(fixes, turn)))
-    turn = float(np.angle(weight @ (np.conj(path) * place) + yaw_weight @ image_turns))
-    reach = np.exp(1j * turn) * path[-1]
+    looks = np.exp(1j * (fixes.yaw - fixes.path_yaw))
+    place, turn = aligned(fixes.path, fixes.place, looks, weight, yaw_weight)
+    path = turn * centered(fixes.path, weight)
+    newest = fixes.place[-1] - place[-1] + path[-1]
     turn_variance = 1 / (weight @ np.abs(path) ** 2 + yaw_weight.sum() + _TINY)
-    by_turn = np.array([-reach.imag, reach.real, 1.0])
-    covariance = np.diag([1 / total, 1 / total, 0.0]) + turn_variance * np.outer(by_turn, by_turn)
+    by_turn = np.array([-path[-1].imag, path[-1].real, 1.0])
+    place_variance = 1 / weight.sum()
+    covariance = np.diag([place_variance, place_variance, 0.0])
+    covariance += turn_variance * np.outer(by_turn, by_turn)
     count = int(agree.sum())
     distance_m = float(fixes.behind_m[agree].max())
     # Neighboring images err alike and count as fewer.
     dependence = max(1.0, count / (1 + distance_m / decorrelation_m))
-    newest = middle + reach
+    yaw = wrap_angle(fixes.path_yaw[-1] + np.angle(turn[0]))
     return Relocation(
-        np.array([newest.real, newest.imag, wrap_angle(fixes.path_yaw[-1] + turn)]),
+        np.array([newest.real, newest.imag, yaw]),
         covariance * dependence,
         count,
         distance_m,
         bool(has_yaw.any()),
     )
+
+
+def aligned(
+    path: Complex, places: Complex, looks: Complex, weight: Array, yaw_weight: Array
+) -> tuple[Complex, Complex]:
+    """Lay paths (..., N) on places (N,) m, from which both have a shift: the places from their
+    weighted mean, and the turns u (..., 1) of the paths.
+
+    With weights w and w', centered places z and path d, and images whose headings are turned by v
+    (`looks`) from those of the path, the error sum w |z - u d|^2 + w' |v - u|^2 is least for the u
+    along sum w conj(d) z + w' v.
+    """
+    shown = centered(places, weight)
+    turn = summed(weight * np.conj(centered(path, weight)) * shown) + summed(yaw_weight * looks)
+    return shown, turn / np.maximum(np.abs(turn), _TINY)
+
+
+def centered(values: NDArray[Any] | float, weight: Array) -> NDArray[Any]:
+    """Values from their mean by weights (..., N)."""
+    return np.asarray(values - summed(weight * values) / summed(weight))
+
+
+def summed(values: NDArray[Any]) -> NDArray[Any]:
+    """Sums (..., 1) of values (..., N)."""
+    return np.asarray(values.sum(axis=-1, keepdims=True))

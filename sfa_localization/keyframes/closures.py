@@ -32,6 +32,8 @@ LIKE = 0.55
 """Least correlation of a closure: images of other places reach 0.4, some a little more."""
 STRETCH_M = 6.0
 """Images that are nearer along the same drive are alike because they are neighbors."""
+CLOSURES_MIN = 30
+"""Fewer closures show neither whether images turn better nor the scale of two drives."""
 SAMPLES = 3000
 """Images that are compared, however long the drives."""
 # Candidates that the coarse correlation passes to the full one; with half as many only half of a

@@ -111,6 +111,10 @@ class LeftOut:
         gain = by_keyframes / (by_keyframes + errors.slow_variance(claimed, self.unlike))
         return self.error + gain[:, None] * (error - self.error), by_keyframes * (1 - gain)
 
+    def mean_m(self, error: Array) -> float:
+        """Mean length, m, of errors (M, 2) m."""
+        return float(np.average(np.hypot(*error.T), weights=self.weight))
+
     def _variances(self, errors: ErrorModel) -> Array:
         return errors.variance(self.variance, self.outward, self.unlike)
 

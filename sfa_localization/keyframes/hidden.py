@@ -67,7 +67,7 @@ def completed(spectra: Spectra, seen: Mask, places: Array) -> Spectra:
         others = np.atleast_1d(near)
         others = others[seen[others][:, missing].mean(1) > 0.5][:_NEIGHBORS]
         offset = places[others] - places[row]
-        offset /= max(float(np.hypot(*offset.T).mean()), _TINY) if len(others) else 1
+        offset /= max(np.hypot(*offset.T).mean(), _TINY) if len(others) else 1
         plane = np.column_stack([np.ones(len(others)), offset])
         weight = np.exp(-(offset**2).sum(1) / 2)[:, None] * seen[others][:, missing]
         squares = np.einsum('np,ni,nj->pij', weight, plane, plane)

@@ -49,10 +49,11 @@ class Keyframes:
     """K textures of so many `columns`, with their `poses` (K, 3) [x m, y m, yaw rad] in the map.
 
     They are stored as the spectra of images with yaw 0: `values` (K, F, 2 rows) int8, real and
-    imaginary parts in turn, in units of `step`. `drives` (K,) are the numbers of their drives, of
-    which the first `trained` were those of the training; drives of the training in the same light
-    share a number. `errors` says how well images are located among them. Images show what is `seen`
-    (rows, columns), by default all; what keyframes did not see is filled in: see hidden.py.
+    imaginary parts in turn, in units of `step`. `lights` (K,) are the numbers of their lights, of
+    which the first `trained` were those of the training, whose drives share a light where it is the
+    same; each later drive has its own. `errors` says how well images are located among them. Images
+    show what is `seen` (rows, columns), by default all; what keyframes did not see is filled in:
+    see hidden.py.
     """
 
     values: NDArray[np.int8]
@@ -61,7 +62,7 @@ class Keyframes:
     poses: Array
     errors: ErrorModel
     sphere: Sphere
-    drives: NDArray[np.int32]
+    lights: NDArray[np.int32]
     trained: int
     seen: Mask | None = None
 
@@ -71,7 +72,7 @@ class Keyframes:
         textures: NDArray[np.int8],
         poses: Array,
         sphere: Sphere,
-        drives: NDArray[np.int32],
+        lights: NDArray[np.int32],
         seen: Mask | None = None,
     ) -> Keyframes:
         """Keyframes of the training by quantized textures (K, rows, columns). Raises DataError for
@@ -81,13 +82,14 @@ class Keyframes:
             raise DataError(f'{len(poses)} images are too few for keyframes')
         values, step = encoded(textures, poses, sphere, seen)
         columns = textures.shape[2]
-        trained = int(drives.max()) + 1
-        return cls(values, step, columns, poses, ErrorModel(), sphere, drives, trained, seen)
+        trained = int(lights.max()) + 1
+        return cls(values, step, columns, poses, ErrorModel(), sphere, lights, trained, seen)
 
     def take(self, rows: NDArray[Any]) -> Keyframes:
         """Some of the keyframes, by a mask (K,) or indices."""
-        parts = self.values[rows], self.poses[rows], self.drives[rows]
-        return dataclasses.replace(self, values=parts[0], poses=parts[1], drives=parts[2])
+        return dataclasses.replace(
+            self, values=self.values[rows], poses=self.poses[rows], lights=self.lights[rows]
+        )
 
     def spectrum(self, row: int) -> Spectra:
         """The spectrum (rows, F) of the texture of a keyframe."""
@@ -107,7 +109,7 @@ class Keyframes:
     @property
     def first(self) -> NDArray[np.bool_]:
         """Which keyframes are of the training (K,)."""
-        return self.drives < self.trained
+        return self.lights < self.trained
 
     @property
     def sign(self) -> int:
@@ -128,10 +130,10 @@ class Keyframes:
 
     def likeliest_lights(self, scores: NDArray[np.float32]) -> list[int]:
         """The lights of the training that the likeliest keyframes are of, by correlations (K,)."""
-        lights, counts = np.unique(self.drives[self.first], return_counts=True)
+        lights, counts = np.unique(self.lights[self.first], return_counts=True)
         # Lights of which too few keyframes are there count where no other one does.
         lights = lights[counts >= min(FEWEST, counts.max(initial=0))]
-        best = [-scores[self.drives == light].max() for light in lights.tolist()]
+        best = [-scores[self.lights == light].max() for light in lights.tolist()]
         return list(lights[np.argsort(best, kind='stable')[:LIGHTS]].tolist())
 
     def around(self, place: Array, light: int) -> Indices:
@@ -140,7 +142,7 @@ class Keyframes:
         """
         distance = np.hypot(*(self.poses[:, :2] - place).T)
         nearest = np.argsort(distance, kind='stable')
-        of_light = nearest[self.drives[nearest] == light][:NEIGHBORS]
+        of_light = nearest[self.lights[nearest] == light][:NEIGHBORS]
         reach = distance[of_light].max(initial=0.0)
         added = nearest[~self.first[nearest] & (distance[nearest] <= reach)][:NEIGHBORS]
         return np.sort(np.concatenate([of_light, added]))
@@ -163,13 +165,13 @@ class Keyframes:
         by_turn = image * (1j * np.arange(image.shape[1])).astype(np.complex64)
         changes = turned(np.concatenate([image[None], slopes, by_turn[None]]), self.sign * yaw)
         places = self.poses[rows, :2]
-        drives = self.drives[rows]
+        lights = self.lights[rows]
         keyframes = self.aligned(rows)
         if self.seen is not None:
             seen = turned_mask(self.seen, self.sign * yaw)
             changes = masked(changes, seen)
             keyframes = masked(keyframes, seen)
-        fit = regress(changes, keyframes, places, drives, self.channels, self.columns)
+        fit = regress(changes, keyframes, places, lights, self.channels, self.columns)
         facing = complex(fit.shares @ np.exp(1j * self.poses[rows, 2]))
         turn = float(fit.changes[2])
         yaw = yaw - self.sign * turn
@@ -178,8 +180,9 @@ class Keyframes:
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to save, without pickle."""
-        names = 'values', 'step', 'columns', 'poses', 'drives', 'trained'
+        names = 'values', 'step', 'columns', 'poses'
         arrays = {name: np.asarray(getattr(self, name)) for name in names}
+        arrays |= {'drives': self.lights, 'trained': np.asarray(self.trained)}
         arrays |= {} if self.seen is None else {'seen': self.seen}
         return {**arrays, 'errors': np.array(dataclasses.astuple(self.errors))}
 
@@ -189,12 +192,12 @@ class Keyframes:
         values = np.asarray(arrays['values'], np.int8)
         step = float(arrays['step'])
         poses = arrays['poses'].astype(float)
-        drives = arrays['drives'].astype(np.int32)
+        lights = arrays['drives'].astype(np.int32)
         errors = ErrorModel(*arrays['errors'].astype(float).tolist())
         columns = int(arrays['columns'])
         trained = int(arrays['trained'])
         seen = np.asarray(arrays['seen'], bool) if 'seen' in arrays else None
-        return cls(values, step, columns, poses, errors, sphere, drives, trained, seen)
+        return cls(values, step, columns, poses, errors, sphere, lights, trained, seen)
 
 
 def encoded(

@@ -25,8 +25,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy import special
 
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.keyframes.errors import ErrorModel
@@ -90,36 +92,54 @@ def located(
     and their variances (H,) m^2 along each axis by the map; `scales` (S,) are the probabilities of
     `SCALES` by the images before, `tilt` (2,) that of the image.
     """
-    numbers = [(f.variance, f.outward, f.unlike, f.yaw, f.evidence, f.start) for f in fits]
-    by_residual, outward, unlike, yaws, evidence, starts = np.array(numbers).T
-    places = np.array([f.place for f in fits])
-    # (H, 1), and at all scales (H, S).
-    by_keyframes = errors.variance(by_residual, outward, unlike)[:, None]
-    by_slow = errors.slow_variance(slow[1], unlike)[:, None]
-    total = by_keyframes + by_slow * SCALES
-    gain = by_keyframes / total
-    difference = slow[0] - places
-    joint = evidence[:, None] + np.log(scales) - np.log(total)
-    joint -= (difference**2).sum(1)[:, None] / (2 * total)
-    weight = np.exp(joint - joint.max())
-    weight /= weight.sum()
-    means = places[:, None] + gain[:, :, None] * difference[:, None]
+    mixture = _Mixture.of(fits, slow, scales, errors)
+    weight = mixture.weight
     by_fit = weight.sum(axis=1)
+    unlike, yaws, starts = np.array([(f.unlike, f.yaw, f.start) for f in fits]).T
     here = starts == np.bincount(starts.astype(int), by_fit).argmax()
     near = np.where(here[:, None], weight, 0.0) / by_fit[here].sum()
-    place = np.tensordot(near, means, 2)
+    place = np.tensordot(near, mixture.means, 2)
     of_fit = near.sum(axis=1)
     yaw = float(np.angle(of_fit @ np.exp(1j * yaws)))
     # The covariance of position and heading omits the other hypotheses.
     covariance = np.zeros((3, 3))
-    offset = means - place
+    offset = mixture.means - place
     covariance[:2, :2] = np.einsum('hs,hsi,hsj->ij', weight, offset, offset)
-    covariance[:2, :2] += float((weight * by_keyframes * (1 - gain)).sum()) * np.eye(2)
+    covariance[:2, :2] += mixture.variance * np.eye(2)
     covariance[2, 2] = by_fit @ (wrap_angle(yaws - yaw) ** 2 + errors.yaw_variance(unlike))
     fit = fits[int(of_fit.argmax())]
     pose = np.array([*place, wrap_angle(yaw)])
     facing = complex(of_fit @ np.array([f.facing for f in fits]))
     return Location(pose, covariance, fit, facing, weight.sum(axis=0), tilt)
+
+
+class _Mixture(NamedTuple):
+    """Terms of H hypotheses at S scales, with the `weight` (H, S) of sum 1 and the `means`
+    (H, S, 2) m, and their mean `variance`, m^2 per axis.
+    """
+
+    weight: Array
+    means: Array
+    variance: float
+
+    @classmethod
+    def of(
+        cls, fits: Sequence[Fit], slow: tuple[Array, Array], scales: Array, errors: ErrorModel
+    ) -> _Mixture:
+        """See `located`."""
+        numbers = [(f.variance, f.outward, f.unlike, f.evidence) for f in fits]
+        by_residual, outward, unlike, evidence = np.array(numbers).T
+        places = np.array([f.place for f in fits])
+        by_keyframes = errors.variance(by_residual, outward, unlike)[:, None]
+        by_slow = errors.slow_variance(slow[1], unlike)[:, None]
+        total = by_keyframes + by_slow * SCALES
+        gain = by_keyframes / total
+        difference = slow[0] - places
+        joint = evidence[:, None] + np.log(scales) - np.log(total)
+        joint -= (difference**2).sum(1)[:, None] / (2 * total)
+        weight = special.softmax(joint)
+        means = places[:, None] + gain[:, :, None] * difference[:, None]
+        return cls(weight, means, float((weight * by_keyframes * (1 - gain)).sum()))
 
 
 def _from_starts(keyframes: Keyframes, image: UprightImage, pattern: Spectra | None) -> list[Fit]:

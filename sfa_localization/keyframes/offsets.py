@@ -70,11 +70,11 @@ def find_offsets(views: Textures, poses: Array, sphere: Sphere) -> Offsets:
             continue
         fit = keyframes.fit(keyframes.spectrum(row), poses[row, 2], near)
         if fit.unlike < _UNLIKE:
-            shares, turn = np.zeros((2, NEIGHBORS))
-            others = np.full(NEIGHBORS, near[0])
-            others[: len(near)] = near
-            shares[: len(near)] = fit.shares
-            turn[: len(near)] = fit.yaw - poses[near, 2]
+            # Fewer neighbors are filled up with some of no share.
+            missing = (0, NEIGHBORS - len(near))
+            others = np.pad(near, missing, constant_values=near[0])
+            shares = np.pad(fit.shares, missing)
+            turn = np.pad(fit.yaw - poses[near, 2], missing)
             offsets.append((row, others, shares, turn, fit.unlike))
     if not offsets:
         return Offsets.none()

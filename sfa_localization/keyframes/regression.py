@@ -3,8 +3,8 @@
 """The position of an image among neighboring keyframes: a regression of positions on textures.
 
 Turned to one heading, the textures q_k of N keyframes at places p_k differ by how far things move
-over the panorama, which is about linear in the place over some decimeters. The mean of each drive
-(its light), the likeness to the mean of all, and the changes by roll, pitch and heading are
+over the panorama, which is about linear in the place over some decimeters. The mean of each
+light, the likeness to the mean of all, and the changes by roll, pitch and heading are
 projected out. Another light reduces all differences by one factor, so the image is scaled. With
 A the Gram matrix of the residual textures, a their products with the residual image, and w the
 weights of likeness, ridge regression gives
@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +84,7 @@ def regress(
     image: Spectra,
     keyframes: Spectra,
     places: Array,
-    drives: NDArray[np.int32],
+    lights: NDArray[np.int32],
     channels: Sequence[slice],
     columns: int,
 ) -> Fit:
@@ -91,33 +92,40 @@ def regress(
 
     `image` (4, rows, F) is the spectrum of its texture, and of the derivatives of that by roll,
     pitch and a turn, at the heading of the keyframes. Textures have so many `columns`, and their
-    `channels` are rows; keyframes of different `drives` (N,) may differ by their light.
+    `channels` are rows; keyframes may be of several `lights` (N,).
     """
     count = len(keyframes)
     heights = [part.stop - part.start for part in channels]
     spectra = np.concatenate([keyframes, image])
-    weighted = spectra * _root_weights(spectra.shape[2], columns)
-    parts = (weighted[:, part].reshape(len(spectra), -1).view(np.float32) for part in channels)
-    products = np.stack([part @ part.T for part in parts]).astype(float)
-    basis = _Basis.of(products[:, count, :count].sum(axis=0), drives, places)
-    # Differences shrink in another light as the likeness of the image to the mean does.
-    mean = products[:, :count, :count] @ basis.mean
-    likeness = products[:, count, :count] @ basis.mean
-    gains = np.maximum(likeness / np.maximum(mean @ basis.mean, 1e-12), _LEAST_GAIN)
+    products = _products(spectra, channels, columns)
+    basis = _Basis.of(products[:, count, :count].sum(axis=0), lights, places)
+    gains = basis.gains(products)
     scale = np.ones((len(channels), len(spectra)))
     scale[:, count:] /= gains[:, None]
     products *= scale[:, :, None] * scale[:, None]
     trust = _trust(gains, products, basis, heights)
-    combine, shares, changes, unlike = _regression(np.tensordot(trust, products, 1), basis)
-    by_row = np.repeat(combine[:, None] * scale, heights, axis=1).astype(np.float32)
-    residual, *along = np.einsum('crn,nrf->crf', by_row, spectra, optimize=True)
-    rows = np.repeat([trust, gains], heights, axis=1).astype(np.float32)
-    moved = _moved_by_sectors(residual, along, rows[0], columns)
-    place = shares @ places
-    offset = places - place
-    outward = float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
-    residual = residual * rows[1][:, None]
-    return Fit(place, shares, changes, unlike, residual, float((moved**2).sum()) / 2, outward)
+    found = _regression(np.tensordot(trust, products, 1), basis)
+    by_row = np.repeat(found.combinations[:, None] * scale, heights, axis=1).astype(np.float32)
+    residual, *directions = np.einsum('crn,nrf->crf', by_row, spectra, optimize=True)
+    trust_of_rows, gain_of_rows = np.repeat([trust, gains], heights, axis=1).astype(np.float32)
+    variance = _variance(residual, directions, trust_of_rows, columns)
+    place = found.shares @ places
+    changes = -found.combinations[0, count + 1 :]
+    residual = residual * gain_of_rows[:, None]
+    outward = _outward(places - place)
+    return Fit(place, found.shares, changes, found.unlike, residual, variance, outward)
+
+
+def _outward(offset: Array) -> float:
+    """`Fit.outward` of a place from which keyframes lie at an offset (N, 2) m."""
+    return float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
+
+
+def _products(spectra: Spectra, channels: Sequence[slice], columns: int) -> Array:
+    """Products (C, n, n) of n textures by channel, of their spectra (n, rows, F)."""
+    weighted = spectra * _root_weights(spectra.shape[2], columns)
+    parts = (weighted[:, part].reshape(len(spectra), -1).view(np.float32) for part in channels)
+    return np.stack([part @ part.T for part in parts]).astype(float)
 
 
 def _root_weights(frequencies: int, columns: int) -> Texture:
@@ -129,7 +137,7 @@ def _root_weights(frequencies: int, columns: int) -> Texture:
 @dataclass(frozen=True, slots=True)
 class _Basis:
     """What N keyframes are compared with: the shares `mean` (N,) of the mean that is most like the
-    image, and `centered` (N, N), which subtracts from each keyframe the likest mean of its drive;
+    image, and `centered` (N, N), which subtracts from each keyframe the likest mean of its light;
     their `places` (N, 2) m, and their `weight` (N,) in the regression, of sum 1.
     """
 
@@ -139,14 +147,30 @@ class _Basis:
     weight: Array
 
     @classmethod
-    def of(cls, scores: Array, drives: NDArray[np.int32], places: Array) -> _Basis:
+    def of(cls, scores: Array, lights: NDArray[np.int32], places: Array) -> _Basis:
         """By the correlations (N,) of the keyframes with the image, which say how near they are
-        among those of one drive.
+        among those of one light.
         """
-        numbers, drive = np.unique(drives, return_inverse=True)
-        means = _likest(np.where(numbers[:, None] == drives, scores, -np.inf))
-        centered = np.eye(len(drives)) - means[drive]
+        numbers, light = np.unique(lights, return_inverse=True)
+        means = _likest(np.where(numbers[:, None] == lights, scores, -np.inf))
+        centered = np.eye(len(lights)) - means[light]
         return cls(_likest(scores), centered, places, means.mean(axis=0))
+
+    def nuisance(self, number: int) -> Array:
+        """What is projected out of so many textures (1 + M, n): likeness, tilt and heading."""
+        count = len(self.mean)
+        rows = np.eye(number)[count:]
+        rows[0, :count] = self.mean
+        rows[0, count] = 0.0
+        return rows
+
+    def gains(self, products: Array) -> Array:
+        """The factors (C,) of the light on all differences: another light reduces them as it does
+        the likeness of the image to the mean. By products (C, n, n)."""
+        count = len(self.mean)
+        square = products[:, :count, :count] @ self.mean @ self.mean
+        likeness = products[:, count, :count] @ self.mean
+        return np.maximum(likeness / np.maximum(square, 1e-12), _LEAST_GAIN)
 
 
 def _likest(scores: Array) -> Array:
@@ -157,55 +181,69 @@ def _likest(scores: Array) -> Array:
 
 def _trust(gains: Array, products: Array, basis: _Basis, heights: Sequence[int]) -> Array:
     """How much each channel (C,) counts, 1 at most: by how well the keyframes explain it."""
-    residual = _regression(np.tensordot(gains**2, products, 1), basis)[0][0]
+    residual = _regression(np.tensordot(gains**2, products, 1), basis).combinations[0]
     errors = (products @ residual) @ residual / heights
     trust = 1 / (errors + errors.min() + 1e-12)
     return np.asarray(trust / trust.max())
 
 
-def _regression(products: Array, basis: _Basis) -> tuple[Array, Array, Array, float]:
-    """The regression by the products (n, n), n = N + 1 + M, of N keyframes, the image, and M
-    changes by roll, pitch and heading: the combinations (3, n) of these that are the residual of
-    the image and the two directions along which it moves the place; the shares (N,) of the
-    keyframes; the changes (M,) that the image shows; and `Fit.unlike`.
+class _Regression(NamedTuple):
+    """By n = N + 1 + M textures, of N keyframes, the image, and M changes by roll, pitch and
+    heading: the `combinations` (3, n) of these that are the residual of the image and the two
+    directions along which it moves the place; the `shares` (N,) of the keyframes; and
+    `Fit.unlike`.
     """
+
+    combinations: Array
+    shares: Array
+    unlike: float
+
+
+def _regression(products: Array, basis: _Basis) -> _Regression:
+    """The regression by the products (n, n) of all textures."""
     count = len(basis.mean)
-    # Project out drive mean, likeness, tilt and heading; `gram` is that of the residuals.
-    nuisance = np.eye(len(products))[count:]
-    nuisance[0, :count] = basis.mean
-    nuisance[0, count] = 0.0
+    nuisance = basis.nuisance(len(products))
     within = nuisance @ products @ nuisance.T
-    square = max(float(within[0, 0]), 1e-12)
-    within[np.diag_indices(len(within))] += 1e-9 * within.diagonal() + 1e-12
-    rest = np.eye(count + 1, len(products))
-    rest[:count, :count] = basis.centered
-    along = np.asarray(np.linalg.solve(within, nuisance @ products @ rest.T), float)
-    rest -= along.T @ nuisance
-    gram = rest @ products @ rest.T
+    residuals = _residuals(nuisance, within, products, basis)
+    gram = residuals @ products @ residuals.T
     root = np.sqrt(basis.weight)[:, None]
     system = gram[:-1, :-1] * root * root.T
-    system[np.diag_indices(count)] += max(_RIDGE * float(system.trace()), 1e-12)
-    wanted = np.column_stack([-gram[:-1, -1], basis.centered @ basis.places]) * root
-    solution = (np.linalg.solve(system, wanted) * root).T
-    combine = solution @ rest[:-1]
-    combine[0] += rest[-1]
-    # An image without any texture has no residual, and keeps nothing of the mean either.
-    kept = max(float(nuisance[0] @ products[:, count]) / square, 0.0)
-    unexplained = max(float(combine[0] @ products @ combine[0]) / square, 0.0)
-    unlike = (unexplained + _TINY) / (kept**2 + _TINY**2)
+    system += max(_RIDGE * float(system.trace()), 1e-12) * np.eye(count)
+    targets = np.column_stack([-gram[:-1, -1], basis.centered @ basis.places]) * root
+    solution = (np.linalg.solve(system, targets) * root).T
+    combinations = solution @ residuals[:-1]
+    combinations[0] += residuals[-1]
+    # An image without any texture has no residual, and is not like the mean either.
+    square = max(within[0, 0], 1e-12)
+    likeness = max(nuisance[0] @ products[:, count] / square, 0.0)
+    unexplained = max(combinations[0] @ products @ combinations[0] / square, 0.0)
+    unlike = (unexplained + _TINY) / (likeness**2 + _TINY**2)
     shares = basis.mean - solution[0] @ basis.centered
-    changes = -combine[0, count + 1 :]
-    return combine, shares, changes, unlike
+    return _Regression(combinations, shares, float(unlike))
 
 
-def _moved_by_sectors(
-    residual: Spectra, along: Sequence[Spectra], trust: Texture, columns: int
-) -> Array:
-    """Displacement (2, sectors) m that the residual of each sector causes: errors by light and
-    occlusion are correlated within a sector, independent between sectors.
+def _residuals(nuisance: Array, within: Array, products: Array, basis: _Basis) -> Array:
+    """The combinations (N + 1, n) that are keyframes and image without the mean of their light and
+    the `nuisance` (1 + M, n), whose products are `within`.
     """
-    textures = columns_of(np.stack([residual, *along]), columns)
+    count = len(basis.mean)
+    ridge = np.diag(1e-9 * within.diagonal() + 1e-12)
+    residuals = np.eye(count + 1, len(products))
+    residuals[:count, :count] = basis.centered
+    shares = np.linalg.solve(within + ridge, nuisance @ products @ residuals.T)
+    return np.asarray(residuals - shares.T @ nuisance)
+
+
+def _variance(
+    residual: Spectra, directions: Sequence[Spectra], trust: Texture, columns: int
+) -> float:
+    """`Fit.variance` of a residual, from textures along the directions of the place and the `trust`
+    (rows,): errors by light and occlusion are correlated within a sector, independent between
+    sectors.
+    """
+    textures = columns_of(np.stack([residual, *directions]), columns)
     moved = trust @ (textures[1:] * textures[0])
     sectors = min(_SECTORS, columns)
     starts = np.arange(sectors) * columns // sectors
-    return np.add.reduceat(moved, starts, axis=1).astype(float)
+    by_sector = np.add.reduceat(moved, starts, axis=1).astype(float)
+    return float((by_sector**2).sum()) / 2

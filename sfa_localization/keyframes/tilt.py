@@ -74,19 +74,15 @@ def find_tilt(
     tried: the correlation of an image with a tilt is a sum over the columns, each moved up or down.
     """
     rows = channels[0].stop
-    count = len(others)
     # Rows of a channel with fewer of them are as many finer ones.
-    fine = [part.start + np.arange(rows) * (part.stop - part.start) // rows for part in channels]
-    level = columns_of(turned(others, turn)[:, np.stack(fine)], columns)
+    fine = np.stack(
+        [part.start + np.arange(rows) * (part.stop - part.start) // rows for part in channels]
+    )
+    level = columns_of(turned(others, turn)[:, fine], columns)
     row_rad = (sphere.high - sphere.low) / rows
     most = max(min(round(float(_LARGEST) / row_rad), rows // 2 - 1), 1)
     steps = np.arange(-most, most + 1)
-    padded = np.pad(columns_of(image[np.stack(fine)], columns), ((0, 0), (most, most), (0, 0)))
-    by_step = np.empty((count, columns, len(steps)), np.float32)
-    for k, step in enumerate(steps.tolist()):
-        moved = padded[:, most - step : most - step + rows]
-        overlap = np.sqrt(rows / (rows - abs(step)))
-        by_step[:, :, k] = overlap * np.einsum('mhrc,hrc->mc', level, moved)
+    by_step = _by_step(columns_of(image[fine], columns), level, most)
     azimuth = sphere.azimuths(columns)[:, None, None]
     shift = np.clip(steps * np.cos(azimuth) - steps[:, None] * np.sin(azimuth), -most, most)
     # Linear between two whole rows: (columns, steps, rolls, pitches).
@@ -94,6 +90,20 @@ def find_tilt(
     scores = np.tensordot(by_step, weights.astype(np.float32), 2)
     scores -= (_UNLIKELY * row_rad**2 * np.add.outer(steps**2, steps**2)).astype(np.float32)
     return row_rad * (_peaks(scores) - most), scores.max((1, 2))
+
+
+def _by_step(image: Texture, level: Texture, most: int) -> Texture:
+    """Correlations (M, columns, steps) of the columns of an image (C, rows, columns), moved up by
+    -most to most rows, with those of M level ones (M, C, rows, columns).
+    """
+    rows = image.shape[1]
+    padded = np.pad(image, ((0, 0), (most, most), (0, 0)))
+    by_step = []
+    for step in range(-most, most + 1):
+        moved = padded[:, most - step : most - step + rows]
+        overlap = np.sqrt(rows / (rows - abs(step)))
+        by_step.append(overlap * np.einsum('mhrc,hrc->mc', level, moved))
+    return np.stack(by_step, axis=2).astype(np.float32)
 
 
 def _peaks(scores: Texture) -> Array:

@@ -105,15 +105,15 @@ def fit_among(keyframes: Keyframes, row: int, among: NDArray[np.bool_]) -> Fit |
 
 def _by_light(keyframes: Keyframes) -> Keyframes:
     """With one number for all drives in the same light: together they are nearer to any place."""
-    lights = np.full(len(keyframes.drives), -1, np.int32)
+    lights = np.full(len(keyframes.lights), -1, np.int32)
     count = 0
-    for drive in np.unique(keyframes.drives).tolist():
-        rows = np.flatnonzero(keyframes.drives == drive)
+    for drive in np.unique(keyframes.lights).tolist():
+        rows = np.flatnonzero(keyframes.lights == drive)
         shares = [_of_light(keyframes, rows, lights == light) for light in range(count)]
         same = [light for light in range(count) if shares[light] < _OF_LIGHT]
         lights[rows] = min(same, key=shares.__getitem__, default=count)
         count = int(lights.max()) + 1
-    return dataclasses.replace(keyframes, drives=lights, trained=count)
+    return dataclasses.replace(keyframes, lights=lights, trained=count)
 
 
 def _of_light(keyframes: Keyframes, rows: Indices, of_light: NDArray[np.bool_]) -> float:

@@ -10,7 +10,10 @@ and no wheels, so that it tells a lever arm from wheels that slip in turns.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from scipy import linalg
 from scipy.ndimage import minimum_filter1d
 
 from sfa_localization.data.geometry import Array, Indices, Mask
@@ -44,6 +47,33 @@ def lever_square(views: Textures, yaw: Array) -> Quantity | None:
     """|l|^2, m^2, with its standard deviation by the scatter, by views with headings (S,) rad of
     odometry; None where there are too few turns, or no way to compare them with.
     """
+    pairs = _pairs(views, yaw)
+    if min(len(each.size) for each in pairs) < _FEWEST:
+        return None
+    turned, driven = (_medians(views, each) for each in pairs)
+    sizes = linalg.block_diag(turned[:, :1], driven[:, :1])
+    rows = np.column_stack([np.ones(len(sizes)), sizes])
+    changes = np.concatenate([turned[:, 1], driven[:, 1]])
+    solution = np.linalg.lstsq(rows, changes, rcond=None)[0]
+    _, by_turn, by_way = solution.tolist()
+    if by_way <= 0:
+        return None
+    residual = (changes - rows @ solution)[:_GROUPS]
+    spread = np.var(turned[:, 0]) * _GROUPS
+    std = np.sqrt(residual @ residual / (_GROUPS - 2) / max(float(spread), 1e-12))
+    return Quantity(max(by_turn, 0.0) / by_way, float(std) / by_way)
+
+
+class _Pairs(NamedTuple):
+    """Pairs (P,) of images, and the `size`, m^2, of the square of a turn or way between both."""
+
+    first: Indices
+    last: Indices
+    size: Array
+
+
+def _pairs(views: Textures, yaw: Array) -> tuple[_Pairs, _Pairs]:
+    """Pairs between which the robot turned on the spot, and between which it drove ahead."""
     lags = range(1, _LAGS + 1)
     first = np.concatenate([np.arange(len(yaw) - lag) for lag in lags])
     last = np.concatenate([np.arange(lag, len(yaw)) for lag in lags])
@@ -52,36 +82,21 @@ def lever_square(views: Textures, yaw: Array) -> Quantity | None:
     turn = np.abs(yaw[last] - yaw[first])
     spot = same & (way < SPOT_M) & (turn > TURNS_RAD[0]) & (turn < TURNS_RAD[1])
     ahead = same & (turn < STRAIGHT_RAD) & (way > AHEAD_M[0]) & (way < AHEAD_M[1])
-    if min(spot.sum(), ahead.sum()) < _FEWEST:
-        return None
-    chord = np.abs(np.exp(1j * turn[spot]) - 1) ** 2
-    turned = _medians(views, first[spot], last[spot], chord)
-    driven = _medians(views, first[ahead], last[ahead], way[ahead] ** 2)
-    rows = np.zeros((2 * _GROUPS, 3))
-    rows[:, 0] = 1
-    rows[:_GROUPS, 1] = turned[:, 0]
-    rows[_GROUPS:, 2] = driven[:, 0]
-    changes = np.concatenate([turned[:, 1], driven[:, 1]])
-    solution = np.linalg.lstsq(rows, changes, rcond=None)[0]
-    _, by_turn, by_way = solution.tolist()
-    residual = (changes - rows @ solution)[:_GROUPS]
-    spread = np.var(turned[:, 0]) * _GROUPS
-    std = np.sqrt(residual @ residual / (_GROUPS - 2) / max(float(spread), 1e-12))
-    return Quantity(max(by_turn, 0.0) / by_way, float(std) / by_way) if by_way > 0 else None
+    chord = np.abs(np.exp(1j * turn[spot]) - 1)
+    turned = _Pairs(first[spot], last[spot], chord**2)
+    return turned, _Pairs(first[ahead], last[ahead], way[ahead] ** 2)
 
 
-def _medians(views: Textures, first: Indices, last: Indices, size: Array) -> Array:
-    """Of pairs (P,) of textures, in groups of one size (P,), the medians of that and of their
-    change (groups, 2): minus the logarithm of their correlation at low frequencies, turned to be
-    most alike.
+def _medians(views: Textures, pairs: _Pairs) -> Array:
+    """Of pairs of textures, in groups of one size, the medians of that and of their change
+    (groups, 2): minus the logarithm of their correlation at low frequencies, turned to be most
+    alike.
     """
-    rows = evenly(len(size), _MOST)
-    first = first[rows]
-    last = last[rows]
-    size = size[rows]
+    rows = evenly(len(pairs.size), _MOST)
+    size = pairs.size[rows]
     textures = views.textures
-    columns = views.textures.shape[2]
-    used, pairs = np.unique([first, last], return_inverse=True)
+    columns = textures.shape[2]
+    used, chosen = np.unique([pairs.first[rows], pairs.last[rows]], return_inverse=True)
     low = spectra_of(textures[used])
     low[:, :, [0, *range(FREQUENCIES + 1, low.shape[2])]] = 0
     norm = np.linalg.norm(low, axis=(1, 2), keepdims=True) * np.sqrt(2 / columns)
@@ -89,7 +104,7 @@ def _medians(views: Textures, first: Indices, last: Indices, size: Array) -> Arr
     seen = views.seen
     if seen is not None:  # without that into which low frequencies carry what was not seen
         seen = minimum_filter1d(seen, 1 + columns // FREQUENCIES, mode='wrap')
-    likeness = [_likeness(low[a], low[[b]], columns, seen) for a, b in pairs.reshape(2, -1).T]
+    likeness = [_likeness(low[a], low[[b]], columns, seen) for a, b in chosen.reshape(2, -1).T]
     change = -np.log(np.maximum(np.array(likeness, np.float32), 0.05))
     groups = np.array_split(np.argsort(size, kind='stable'), _GROUPS)
     return np.array([[np.median(size[group]), np.median(change[group])] for group in groups])

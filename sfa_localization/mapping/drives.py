@@ -79,6 +79,13 @@ class Drives:
     offsets: Offsets = field(default_factory=Offsets.none)
     points: Points | None = None
     mount: Mount = field(default_factory=Mount)
+    tracks: tuple[OdometryTrack, ...] = ()
+    """Dead reckoning of each drive, with the turns of its images where these are better; estimated
+    once, if not given."""
+
+    def __post_init__(self) -> None:
+        if not self.tracks:
+            object.__setattr__(self, 'tracks', tuple(self._estimated_tracks()))
 
     @property
     def starts(self) -> list[int]:
@@ -86,8 +93,7 @@ class Drives:
         counts = [len(drive.run.panoramas) for drive in self.items]
         return [sum(counts[:k]) for k in range(len(counts))]
 
-    def tracks(self) -> list[OdometryTrack]:
-        """Dead reckoning of each drive, with the turns of its images where these are better."""
+    def _estimated_tracks(self) -> list[OdometryTrack]:
         runs = [drive.run for drive in self.items]
         tracks = [OdometryTrack.of(run.odometry, self.config, run.yaw_rate) for run in runs]
         turns = estimated(self._headings(tracks), self.closures)
@@ -119,7 +125,7 @@ class Drives:
         ways = ways or [None] * len(self.items)
         mount = self.mount.of(len(self.items))
         parts = []
-        for track, way, drive in zip(self.tracks(), ways, self.items, strict=True):
+        for track, way, drive in zip(self.tracks, ways, self.items, strict=True):
             track = replace(track.driven(way) if way else track, lever=mount.lever)
             parts.append(cut_track(track, drive.stamps_ns, self.config))
         offsets = self.offsets.of_robot(self._camera_yaw)
@@ -141,7 +147,7 @@ class Drives:
     def measured(self, views: Textures, sphere: Sphere) -> Drives:
         """With the offsets of `views`, near the poses of the graph of odometry and closures, and
         the camera's place on the robot, which both determine together."""
-        headings = self._headings(self.tracks())
+        headings = self._headings(self.tracks)
         turns = np.concatenate([each.track for each in headings])[views.images]
         mount = replace(self.mount, turning=lever_square(views, turns))
         drives = replace(self, mount=mount)
@@ -183,7 +189,7 @@ class Drives:
         ways = list[Way | None]()
         longer = list[float]()
         for track, images, before in zip(
-            self.tracks(), self.image_poses(result), segments.ways, strict=True
+            self.tracks, self.image_poses(result), segments.ways, strict=True
         ):
             way = way_of(track, *images, before)
             lengths = [
@@ -224,7 +230,7 @@ def _together(drives: Sequence[Quantity]) -> Quantity:
 def compare_with_map(checks: Sequence[MotionCheck], drives: Drives, result: MetricResult) -> None:
     """Add the comparison of the map with the odometry, with corrected turns, to each drive's."""
     for check, drive, track, images in zip(
-        checks, drives.items, drives.tracks(), drives.image_poses(result), strict=True
+        checks, drives.items, drives.tracks, drives.image_poses(result), strict=True
     ):
         pair = compare_map(replace(drive.run.odometry, poses=track.poses), *images)
         check.pairs += [pair] if pair else []

@@ -56,32 +56,36 @@ def learn_keyframes(
     """Keyframes of the images of `views`, where the segments put them; along the drive a turn
     counts as `turn_radius_m` per rad. Raises DataError for too few images."""
     _, seen, row = np.intersect1d(views.images, result.images, return_indices=True)
-    poses = result.poses[row]
     drives = views.run[seen].astype(np.int32)
-    keyframes, kept = choose_keyframes(views.textures[seen], poses, sphere, drives, views.seen)
+    keyframes, kept = choose_keyframes(
+        views.textures[seen], result.poses[row], sphere, drives, views.seen
+    )
     path = _along_tracks(views, segments)[seen][kept]
-    rows = row[kept]
     tried, fits, near_m = located_without(keyframes, path)
-    shared = {'map_m': result.map.common_m, 'turn_std': usual_turn_std(result.angle_covariance)}
     if len(tried) < _ENOUGH:
-        return KeyframeMap(replace(keyframes, errors=replace(ErrorModel(), **shared)))
-    poses = keyframes.poses[tried]
-    rows = rows[tried]
+        return KeyframeMap(_with_errors(keyframes, ErrorModel(), result))
     ground_m = ground_distances(keyframes.poses[:, :2], np.random.default_rng(0))
-    trials = LeftOut.of(fits, poses, importance(near_m, ground_m))
+    trials = LeftOut.of(fits, keyframes.poses[tried], importance(near_m, ground_m))
+    rows = row[kept][tried]
     slow = result.held_out[rows]
     claimed = result.held_out_variance[rows]
     errors = trials.learn_slow(trials.learn(), slow, claimed)
     both, variance = trials.fused(errors, slow, claimed)
-    weight, driven, owner = trials.weight, *_driven(segments, turn_radius_m)
-    joint, alone = (float(np.average(np.hypot(*e.T), weights=weight)) for e in (both, slow))
+    driven, owner = _driven(segments, turn_radius_m)
     return KeyframeMap(
-        replace(keyframes, errors=replace(errors, **shared)),
-        joint / max(alone, 1e-9),
-        share_within((both**2).sum(1) / variance, 0.95, weight),
-        float(np.average(np.abs(trials.turn), weights=weight)),
+        _with_errors(keyframes, errors, result),
+        trials.mean_m(both) / max(trials.mean_m(slow), 1e-9),
+        share_within((both**2).sum(1) / variance, 0.95, trials.weight),
+        float(np.average(np.abs(trials.turn), weights=trials.weight)),
         ErrorCorrelation.fit(both, variance, driven[rows], owner[rows]),
     )
+
+
+def _with_errors(keyframes: Keyframes, errors: ErrorModel, result: MetricResult) -> Keyframes:
+    """Keyframes with these errors, and those that all images share by the map."""
+    turn_std = usual_turn_std(result.graph.angle_covariance)
+    errors = replace(errors, map_m=result.map.common_m, turn_std=turn_std)
+    return replace(keyframes, errors=errors)
 
 
 def _driven(segments: Segments, turn_radius_m: float) -> tuple[Array, Indices]:

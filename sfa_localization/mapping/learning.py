@@ -40,7 +40,7 @@ from sfa_localization.mapping.selection import HeldOut, choose, hold_out
 from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.mapping.turned_maps import TurnedMaps
 from sfa_localization.metric.mount import Mount
-from sfa_localization.metric.pose_graph import Certificate, Graph
+from sfa_localization.metric.pose_graph import Graph
 from sfa_localization.metric.segments import Segments
 from sfa_localization.sfa.image_features import Spectrum
 
@@ -59,17 +59,11 @@ _BATCH = 1000
 
 @dataclass(frozen=True, slots=True)
 class MetricResult:
-    """The map of N segments with M images and R periods, all in the map frame."""
+    """The map of segments with M images, all but `graph` in the map frame."""
 
     map: MetricMap
     poses: Array
     """(M, 3) x m, y m, yaw rad of the camera at `images`, by the segments."""
-    angle_covariance: Array
-    """(N, N) rad^2, of the directions of the segments."""
-    yaw_bias: Array
-    """(R,) rad/s, of the odometry in each period."""
-    certificate: Certificate
-    """Of the directions; of the paper's descent that of the minimum near which it ended."""
     images: Indices
     """(M,) images of the segments, in order."""
     residuals: Array
@@ -87,8 +81,9 @@ class MetricResult:
     points_covariance: Complex
     """(K, K) m^2 per axis, relative to the whole map."""
     diagnostics: Diagnostics
-    graph: Graph | None
-    """That gave the places without features."""
+    graph: Graph
+    """The poses of the segments in their own frame, with the biases of the odometry and the
+    certificate; of the paper's descent that of the minimum near which it ended."""
     mount: Mount
     """Where the camera sits on the robot."""
 
@@ -105,8 +100,8 @@ class MetricResult:
         """Figures of merit; plain numbers and lists."""
         x, y, error = self.forecast.worst
         return {
-            'certified': bool(self.certificate.certified),
-            'certificate': float(self.certificate.eigenvalue),
+            'certified': bool(self.graph.certificate.certified),
+            'certificate': float(self.graph.certificate.eigenvalue),
             'residual_m': float(np.hypot(*self.residuals.T).mean()),
             'expected_error_m': self.forecast.expected_m,
             'worst': {'x_m': x, 'y_m': y, 'expected_error_m': error},
@@ -136,7 +131,7 @@ def learn_metric(
     check_amount(problem.stack, problem.links)
     tied = len(segments.offsets.images) or segments.points
     if tied and config.solver == 'certified':
-        problem = replace(problem, graph=(onto and onto.graph) or Graph.of(segments))
+        problem = replace(problem, graph=onto.graph if onto else Graph.of(segments))
     fit = paper_solver.learn(problem) if config.solver == 'paper' else choose(problem, scale)
     held = hold_out(fit)
     overfits = held.explained < LITTLE and held.variance > OVERFIT * fit.variance
@@ -151,11 +146,16 @@ def learn_metric(
     diagnostics = diagnose(fit)
     _check_certificate(fit)
     check(diagnostics)
-    frame = map_frame(fit)
-    if onto is not None and not (segments.points and segments.points.settled.used.any()):
-        turn, shift = align_complex(fit.places, onto.poses[:, 0] + 1j * onto.poses[:, 1])
-        frame = RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
-    return _result(fit, held, frame, diagnostics)
+    return _result(fit, held, _frame(fit, onto), diagnostics)
+
+
+def _frame(fit: MapFit, onto: MetricResult | None) -> RigidTransform:
+    """The transform from the fit's frame to the map frame."""
+    points = fit.problem.segments.points
+    if onto is None or (points and points.settled.used.any()):
+        return map_frame(fit)
+    turn, shift = align_complex(fit.places, onto.poses[:, 0] + 1j * onto.poses[:, 1])
+    return RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
 
 
 def _check_certificate(fit: MapFit) -> None:
@@ -184,9 +184,6 @@ def _result(
     return MetricResult(
         map=metric_map(fit, frame, inflation, common_m),
         poses=np.column_stack([plane(fit.places * turn + shift), wrap_angle(yaw + frame.yaw_rad)]),
-        angle_covariance=fit.graph.angle_covariance,
-        yaw_bias=fit.graph.poses.bias,
-        certificate=fit.graph.certificate,
         images=fit.stack.images,
         residuals=plane(fit.residuals * turn),
         held_out=plane(held.errors * turn),
@@ -196,7 +193,7 @@ def _result(
         points=points * turn + shift,
         points_covariance=points_covariance,
         diagnostics=diagnostics,
-        graph=fit.problem.graph,
+        graph=fit.graph,
         mount=fit.problem.segments.mount,
     )
 

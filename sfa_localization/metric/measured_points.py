@@ -34,7 +34,7 @@ from sfa_localization.data.geometry import (
     relative,
 )
 from sfa_localization.data.messages import LARGEST_SCALE
-from sfa_localization.data.run import Odometry, Points, Stamps
+from sfa_localization.data.run import Odometry, Points, Stamps, Trajectory
 
 WHEELS_STD = 0.02
 """Prior of the scale of wheels: in drives of real robots they count up to 2 % wrong."""
@@ -88,21 +88,19 @@ class MeasuredPoints:
         """
         nearest = np.full(len(points), -1)
         offset = np.full(len(points), np.inf, complex)
-        start = 0
-        pending = np.ones(len(points), bool)
         turned = np.ones(len(points), complex)
+        pending = np.ones(len(points), bool)
+        start = 0
         for odometry, stamps in drives:
             used = images[(images >= start) & (images < start + len(stamps))] - start
             covered = pending & odometry.trajectory.covers(points.stamps_ns)
             pending &= ~covered
-            after = np.searchsorted(stamps[used], points.stamps_ns)
-            for row in (after - 1, after) if len(used) and covered.any() else ():
-                image = used[row.clip(0, len(used) - 1)]
-                poses = (odometry.trajectory.at(at) for at in (stamps[image], points.stamps_ns))
-                moved = relative(*poses) @ [[1, 0], [1j, 0], [0, 1j]]
-                nearer = covered & (np.abs(moved[:, 0]) < np.abs(offset))
-                nearest[nearer], offset[nearer] = image[nearer] + start, moved[nearer, 0]
-                turned[nearer] = np.exp(moved[nearer, 1])
+            if len(used):
+                at_ns = points.stamps_ns[covered]
+                image, moved = _from_nearest(at_ns, odometry.trajectory, stamps, used)
+                nearest[covered] = image + start
+                offset[covered] = moved[:, 0] + 1j * moved[:, 1]
+                turned[covered] = np.exp(1j * moved[:, 2])
             start += len(stamps)
         near = np.abs(offset) <= NEAR_M
         offset = offset + turned * points.lever
@@ -164,6 +162,20 @@ class MeasuredPoints:
                 f'by the points, the wheels count {1 / settled.scale - 1.0:+.1%} of way: check '
                 'both, and that the points are those of base_link, not of an antenna'
             )
+
+
+def _from_nearest(
+    at_ns: Stamps, path: Trajectory, stamps: Stamps, images: Indices
+) -> tuple[Indices, Array]:
+    """Of the `images` right before and after each time (K,), the nearest (K,), and the motion
+    (K, 3) from it along a path; `stamps` (N,) are those of all images.
+    """
+    after = np.searchsorted(stamps[images], at_ns)
+    around = images[np.clip([after - 1, after], 0, len(images) - 1)]
+    moved = np.stack([relative(path.at(stamps[image]), path.at(at_ns)) for image in around])
+    nearer = np.hypot(moved[:, :, 0], moved[:, :, 1]).argmin(axis=0)
+    rows = np.arange(len(at_ns))
+    return around[nearer, rows], moved[nearer, rows]
 
 
 def settle(measured: MeasuredPoints, places: Complex, covariance: Complex) -> Settled:

@@ -105,42 +105,39 @@ class Mount:
 
     def stepped(self, information: Array, gradient: Array) -> Mount:
         """One step on, by S (4 + D, 4 + D) and B^T r (4 + D,) at the mount of the segments."""
-        mount = self.of(len(gradient) - 4)
-        center = self.given or 0j
-        moved = self.lever - center
         # Of all but the yaw in the first drive, which is 0.
         free = np.delete(np.arange(len(gradient)), 4)
-        value = np.array([moved.real, moved.imag, 0.0, 0.0, *mount.yaw[1:]])
-        information = information[np.ix_(free, free)]
-        pull = information @ value - gradient[free]
-        if self.tracked is not None:
-            tracked, std = self.tracked
-            information[[0, 1], [0, 1]] += 1 / std**2
-            pull[:2] += (tracked - center).real / std**2, (tracked - center).imag / std**2
-        means = []
-        spreads = []
-        evidence = []
-        for prior in mount._priors():
-            spread = np.linalg.inv(information + np.diag(1 / prior))
-            mean = spread @ pull
-            size = np.linalg.slogdet(spread)[1] - np.log(prior).sum()
-            lever = center + complex(*mean[:2])
-            evidence.append((size + pull @ mean) / 2 + self._by_turns(lever))
-            means.append(mean)
-            spreads.append(spread)
-        share = np.array([1.0, 0.0]) if self.given is not None else special.softmax(evidence)
-        mean = share @ np.array(means)
-        deviations = np.array(means) - mean
-        spread = np.einsum('p,pij->ij', share, spreads)
-        spread += np.einsum('p,pi,pj->ij', share, deviations, deviations)
-        covariance = np.insert(np.insert(spread, 4, 0.0, axis=0), 4, 0.0, axis=1)
+        mount = self.of(len(gradient) - 4)
+        center = self.given or 0j
+        information, pull = mount._measured(information[np.ix_(free, free)], gradient[free])
+        estimates = [_posterior(prior, information, pull) for prior in mount._priors()]
+        means, spreads, evidence = map(np.array, zip(*estimates, strict=True))
+        levers = center + means[:, 0] + 1j * means[:, 1]
+        share = np.array([1.0, 0.0])
+        if self.given is None:
+            share = special.softmax(evidence + [self._by_turns(lever) for lever in levers])
+        mean, spread = _mixed(share, means, spreads)
+        # Without the slip, and with the yaw in the first drive.
+        stated = np.delete(np.eye(len(gradient)), (2, 3), axis=0)[:, free]
         return replace(
             self,
             lever=center + complex(*mean[:2]),
             yaw=(0.0, *mean[4:].tolist()),
-            covariance=np.delete(np.delete(covariance, (2, 3), axis=0), (2, 3), axis=1),
-            learned=(lever, float(np.sqrt(spreads[1].diagonal()[:2].mean()))),
+            covariance=stated @ spread @ stated.T,
+            learned=(complex(levers[1]), float(np.sqrt(spreads[1].diagonal()[:2].mean()))),
         )
+
+    def _measured(self, information: Array, gradient: Array) -> tuple[Array, Array]:
+        """The information on [l, s, kappa] (3 + D, 3 + D), with that of tracked points, and its
+        product with the likeliest values, counted from the center of the priors."""
+        center = self.given or 0j
+        moved = self.lever - center
+        pull = information @ [moved.real, moved.imag, 0.0, 0.0, *self.yaw[1:]] - gradient
+        if self.tracked is not None:
+            tracked, std = self.tracked
+            information[[0, 1], [0, 1]] += 1 / std**2
+            pull[:2] += (tracked - center).real / std**2, (tracked - center).imag / std**2
+        return information, pull
 
     def _by_turns(self, lever: complex) -> float:
         """Logarithm of the likelihood of the changes of images in turns, for a lever."""
@@ -183,3 +180,20 @@ class Mount:
             'camera_left': Quantity(self.lever.imag, left_std),
             'camera_yaw': Quantity(float(np.mean(self.yaw)), spread),
         }
+
+
+def _posterior(prior: Array, information: Array, pull: Array) -> tuple[Array, Array, float]:
+    """Mean (3 + D,) of [l, s, kappa] without the first drive's yaw, covariance, and logarithm of
+    the evidence, with the variances (3 + D,) of a prior."""
+    spread = np.asarray(np.linalg.inv(information + np.diag(1 / prior)), float)
+    mean = spread @ pull
+    size = np.linalg.slogdet(spread)[1] - np.log(prior).sum()
+    return mean, spread, (size + pull @ mean) / 2
+
+
+def _mixed(share: Array, means: Array, spreads: Array) -> tuple[Array, Array]:
+    """Mean (n,) and covariance (n, n) of a mixture of P normal distributions by shares (P,)."""
+    mean = share @ means
+    deviations = means - mean
+    spread = np.einsum('p,pij->ij', share, spreads)
+    return mean, spread + np.einsum('p,pi,pj->ij', share, deviations, deviations)

@@ -226,27 +226,26 @@ class ImagePoses:
     def on(cls, track: OdometryTrack, stamps: Stamps, skipped: Counter[str]) -> ImagePoses:
         """Interpolated at the images' stamps (N,); those outside or in a break are counted."""
         inside = (stamps >= track.stamps_ns[0]) & (stamps <= track.stamps_ns[-1])
-        before = np.searchsorted(track.stamps_ns, stamps, 'right') - 1
-        after = np.searchsorted(track.stamps_ns, stamps, 'left')
-        before, after = np.clip([before, after], 0, len(track.stamps_ns) - 1)
+        images = np.flatnonzero(inside)
+        before = np.searchsorted(track.stamps_ns, stamps[images], 'right') - 1
+        after = np.searchsorted(track.stamps_ns, stamps[images], 'left')
         unbroken = track.part[before] == track.part[after]
         skipped['without odometry'] += int((~inside).sum())
-        skipped['in a break of odometry'] += int((inside & ~unbroken).sum())
-        images = np.flatnonzero(inside & unbroken)
+        skipped['in a break of odometry'] += int((~unbroken).sum())
+        images = images[unbroken]
         x, y, yaw = Trajectory(track.stamps_ns, track.poses).at(stamps[images]).T
         time_s = (stamps[images] - track.stamps_ns[0]) * 1e-9
         seconds = track.seconds
-        moment = summed(np.diff(track.place) * (seconds[1:] + seconds[:-1]) / 2)
         return cls(
             images=images,
             time_s=time_s,
             place=x + 1j * y + track.lever * np.exp(1j * yaw),
             yaw=np.interp(time_s, seconds, track.yaw),
-            part=track.part[before[images]],
+            part=track.part[before[unbroken]],
             length=np.interp(time_s, seconds, track.length),
             turned=np.interp(time_s, seconds, track.turned),
             noise=np.interp(time_s, seconds, track.yaw_variance),
-            moment=np.interp(time_s, seconds, moment),
+            moment=np.interp(time_s, seconds, _moment(track)),
             bridged=np.column_stack([np.interp(time_s, seconds, sums) for sums in track.bridged.T]),
         )
 
@@ -320,6 +319,12 @@ def _pieces(poses: ImagePoses) -> list[Indices]:
         owner = np.minimum(wear / max(wear[-1], 1e-9) * number, number - 1).astype(int)
         pieces += np.split(group, np.flatnonzero(np.diff(owner)) + 1)
     return pieces
+
+
+def _moment(track: OdometryTrack) -> Complex:
+    """Integral of t dp, s m, of the camera's place p."""
+    middle_s = (track.seconds[1:] + track.seconds[:-1]) / 2
+    return summed(np.diff(track.place) * middle_s)
 
 
 def _stretches(poses: ImagePoses, chosen: Indices) -> list[Indices]:

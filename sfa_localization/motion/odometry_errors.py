@@ -22,11 +22,9 @@ from sfa_localization.data.geometry import Array, Complex, Indices, Mask
 from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Run, Stamps
 from sfa_localization.data.statistics import MEDIAN_TO_STD, evenly, outlier_factor
-from sfa_localization.keyframes.closures import Closures, driven
+from sfa_localization.keyframes.closures import CLOSURES_MIN, Closures, driven
 from sfa_localization.motion.dead_reckoning import OdometryTrack, Way, spaced, summed
 
-CLOSURES_MIN = 30
-"""Fewer closures do not show the scale of two drives."""
 STEP_M = 0.3
 """Images this far apart are compared: nearer ones hide a loss in their own errors."""
 CHANCE_STDS = 4.0

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,21 +113,65 @@ def _runs(*keys: NDArray[Any]) -> Indices:
     return np.append(0, np.cumsum(changes))
 
 
-def _matched(
-    true: Complex, here: Complex, windows: csr_array, weight: Array, variance: float
-) -> tuple[Complex, Complex, Array]:
-    """Residuals (M,) m of true places (M,) after the best motion of each of W windows (W, M) of
-    those by the odometry, the products of both (W,), and the mean squares of the latter (W,), m^2.
-    Windows with a weight of 1 have the `variance`, m^2.
+class _Samples(NamedTuple):
+    """M samples that the odometry covers: `places` (M,) m of the truth at `seconds` (M,), in
+    `windows` (W, M), and which are `used` (M,).
     """
-    total = windows @ weight
-    true, here = (path - windows.T @ (windows @ (weight * path) / total) for path in (true, here))
-    match = windows @ (weight * here.conj() * true)
-    power = windows @ (weight * np.abs(here) ** 2)
-    size = np.abs(match) + 1e-12
-    sure = variance / WHEELS_STD**2
-    motion = match / size * (size + sure) / (power + sure)
-    return true - (windows.T @ motion) * here, match, np.where(total > 1, power / total, 0.0)
+
+    odometry: _Comparison
+    places: Complex
+    seconds: Array
+    windows: csr_array
+    used: Mask
+
+    def settled(
+        self, theta: Array, free: Mask, about_s: float
+    ) -> tuple[Array, float, Complex, Complex, Array]:
+        """Theta (4,) with the likeliest `free` values, the robust standard deviation of residuals,
+        and what is `matched` then.
+        """
+        each = len(self.places) / self.windows.shape[0]
+        used = self.used.astype(float) + 1e-6
+        weight = used
+        std = NOISE_M
+        for _ in range(_ROUNDS):
+            found = self.matched(theta, weight, each * std**2)
+            size = np.abs(found[0])
+            std = max(LENGTH_TO_STD * float(np.median(size[self.used])), NOISE_M)
+            weight = used / outlier_factor((size / std) ** 2, 2)
+            slopes = self._slopes(theta, free, weight, each * std**2)
+            weighted = slopes.conj().T * (weight / (each * std**2))
+            information = (weighted @ slopes).real + np.diag(1 / _PRIOR_STD**2)
+            pulled = (theta - [0, 0, about_s, 0]) / _PRIOR_STD**2
+            step = np.linalg.solve(information, -(weighted @ found[0]).real - pulled)
+            theta = theta + np.clip(step, -0.5, 0.5) * free
+            if np.abs(step).max() < _CLOSE:
+                break
+        return theta, std, *found
+
+    def _slopes(self, theta: Array, free: Mask, weight: Array, variance: float) -> Complex:
+        """Derivatives (M, 4) of the residuals by theta."""
+        sides = (theta + by * np.diag(_STEP * free) for by in (0.5, -0.5))
+        ahead, back = ([self.matched(near, weight, variance)[0] for near in side] for side in sides)
+        return np.asarray(np.subtract(ahead, back).T / _STEP)
+
+    def matched(
+        self, theta: Array, weight: Array, variance: float
+    ) -> tuple[Complex, Complex, Array]:
+        """Residuals (M,) m of places after the best motion of each window of the odometry, the
+        products of both (W,), and the mean squares of the latter (W,), m^2. Windows with a weight
+        of 1 have the `variance`, m^2.
+        """
+        windows = self.windows
+        total = windows @ weight
+        paths = self.places, self.odometry.marker(theta, self.seconds)
+        true, here = (path - windows.T @ (windows @ (weight * path) / total) for path in paths)
+        match = windows @ (weight * here.conj() * true)
+        power = windows @ (weight * np.abs(here) ** 2)
+        size = np.abs(match) + 1e-12
+        sure = variance / WHEELS_STD**2
+        motion = match / size * (size + sure) / (power + sure)
+        return true - (windows.T @ motion) * here, match, np.where(total > 1, power / total, 0.0)
 
 
 class _Comparison:
@@ -174,38 +218,18 @@ class _Comparison:
         """
         at = self.seconds[rows] - about_s
         inside = (at >= self.track_s[0]) & (at <= self.track_s[-1])
-        rows, used = rows[inside], self.used[rows[inside]]
+        rows = rows[inside]
+        used = self.used[rows]
         if used.sum() < 3 * WINDOWS_MIN:
             return None
-        windows = self._windows(at[inside])
-        each = len(rows) / windows.shape[0]
         places = self.places[rows].conj() if mirrored else self.places[rows]
-
-        def matched(theta: Array, weight: Array, std: float) -> tuple[Complex, Complex, Array]:
-            here = self.marker(theta, self.seconds[rows])
-            return _matched(places, here, windows, weight, each * std**2)
-
-        weight = used + 1e-6
-        std = NOISE_M
-        for _ in range(_ROUNDS):
-            residual, match, spread = matched(theta, weight, std)
-            std = max(LENGTH_TO_STD * float(np.median(np.abs(residual[used]))), NOISE_M)
-            weight = (used + 1e-6) / outlier_factor((np.abs(residual) / std) ** 2, 2)
-            sides = (theta + by * np.diag(_STEP * free) for by in (0.5, -0.5))
-            ahead, back = ([matched(near, weight, std)[0] for near in side] for side in sides)
-            jacobian = np.subtract(ahead, back).T / _STEP
-            weighted = jacobian.conj().T * (weight / (each * std**2))
-            information = (weighted @ jacobian).real + np.diag(1 / _PRIOR_STD**2)
-            pulled = (theta - [0, 0, about_s, 0]) / _PRIOR_STD**2
-            step = np.linalg.solve(information, -(weighted @ residual).real - pulled)
-            theta = theta + np.clip(step, -0.5, 0.5) * free
-            if np.abs(step).max() < _CLOSE:
-                break
+        samples = _Samples(self, places, self.seconds[rows], self._windows(at[inside]), used)
+        theta, std, residual, match, spread = samples.settled(theta, free, about_s)
         drove = (spread > (self.window_m / 10) ** 2) & (match != 0)
         if drove.sum() < WINDOWS_MIN:
             return None
         turns = np.where(drove, np.exp(1j * np.angle(match)), 0)
-        facing = self._facing(self.seconds[rows] - theta[2]) * (windows.T @ turns)
+        facing = self._facing(self.seconds[rows] - theta[2]) * (samples.windows.T @ turns)
         return _Fit(mirrored, theta, std, rows, residual, facing, turns[drove])
 
     def _windows(self, at: Array) -> csr_array:

@@ -29,7 +29,7 @@ from sfa_localization.data.geometry import Array, Indices, Mask, wrap_angle
 from sfa_localization.data.rig import Quantity
 from sfa_localization.data.run import Stamps
 from sfa_localization.data.statistics import outlier_factor
-from sfa_localization.keyframes.closures import Closures
+from sfa_localization.keyframes.closures import CLOSURES_MIN, Closures
 from sfa_localization.motion.dead_reckoning import OdometryTrack, summed
 
 REACH_M = 4.0
@@ -47,8 +47,6 @@ GYRO_NOISE: Array = np.array([0.001, 0.005]) ** 2
 """A and B of gyroscopes, where their spread is that of images: also cheap ones are no wheels."""
 APART_M = 1.0
 """Images that are farther apart show other things, and match by chance."""
-CLOSURES_MIN = 30
-"""Fewer closures do not show whether images turn better."""
 FACTOR_STD = 0.3
 BIAS_STD = 0.003
 """Priors: of the factor of wheels on any ground, and of a bias, rad/s."""
@@ -105,33 +103,9 @@ def estimated(drives: Sequence[Headings], closures: Closures) -> list[Turns] | N
     if _odometry_is_better(drives, closures):
         return None
     steps = _Steps.of(drives)
-    prior = np.repeat([FACTOR_STD, BIAS_STD], len(drives)) ** -2
     if steps.correlation < ALIKE:
         return None
-    noise = NOISE_FIRST
-    turns = steps.odometry + steps.more
-    outlier = np.ones(len(steps.short))
-    errors = steps.errors(steps.odometry)
-    more = steps.summed(steps.more)
-    counted = steps.summed(errors)
-    for _ in range(_ROUNDS):
-        by_odometry = steps.sources[:, :2] @ noise[:2] + steps.bridged
-        total = by_odometry + steps.sources[:, 2:] @ noise[2:]
-        # Noise of the turns counted would make their factor too small: they are multiplied by the
-        # turns estimated instead (instrumental variables).
-        in_windows = steps.summed(total)
-        weight = steps.whole / (in_windows * outlier)
-        weighted = steps.summed(steps.errors(turns)).T * weight
-        values = np.linalg.solve(weighted @ counted + np.diag(prior), weighted @ more)
-        outlier = outlier_factor((more - counted @ values) ** 2 / in_windows)
-        corrected = errors @ values
-        residual = steps.more - corrected
-        add = corrected + steps.unbroken * by_odometry / total * residual
-        turns = steps.odometry + add
-        noise = steps.noise(residual, noise)
-    variance = by_odometry * np.where(steps.unbroken, 1 - by_odometry / total, 1.0)
-    covariance = np.linalg.inv((counted.T * weight) @ counted + np.diag(prior))
-    stds = np.sqrt(np.diag(covariance))
+    add, variance, values, stds = steps.settled()
     ends = np.cumsum([len(drive.track) - 1 for drive in drives])
     parts = zip(np.split(add, ends[:-1]), np.split(variance, ends[:-1]), values, stds, strict=False)
     return [
@@ -202,11 +176,45 @@ class _Steps:
         given = sources, steps('bridged'), unbroken, short, windows, by_gyro
         return cls(odometry, more, own, time_s, *given)
 
+    def settled(self) -> tuple[Array, Array, Array, Array]:
+        """What to add to the turns of the odometry (M,) rad, the variances (M,) of the sums, and
+        the factors and biases (2 D,) of the drives with their standard deviations.
+        """
+        prior = np.diag(np.repeat([FACTOR_STD, BIAS_STD], self.own.shape[1]) ** -2)
+        noise = NOISE_FIRST
+        turns = self.odometry + self.more
+        outlier = np.ones(len(self.short))
+        errors = self.errors(self.odometry)
+        more = self.in_short_windows(self.more)
+        counted = self.in_short_windows(errors)
+        for _ in range(_ROUNDS):
+            by_odometry, total = self.variances(noise)
+            # Noise of the turns counted would make their factor too small: they are multiplied by
+            # the turns estimated instead (instrumental variables).
+            uncertain = self.in_short_windows(total)
+            weight = self.whole / (uncertain * outlier)
+            weighted = self.in_short_windows(self.errors(turns)).T * weight
+            values = np.linalg.solve(weighted @ counted + prior, weighted @ more)
+            outlier = outlier_factor((more - counted @ values) ** 2 / uncertain)
+            corrected = errors @ values
+            residual = self.more - corrected
+            add = corrected + self.unbroken * by_odometry / total * residual
+            turns = self.odometry + add
+            noise = self.noise(residual, noise)
+        variance = by_odometry * np.where(self.unbroken, 1 - by_odometry / total, 1.0)
+        covariance = np.linalg.inv((counted.T * weight) @ counted + prior)
+        return add, variance, values, np.sqrt(np.diag(covariance))
+
+    def variances(self, noise: Array) -> tuple[Array, Array]:
+        """Of the turns by odometry, and of odometry and images together, (M,) rad^2."""
+        by_odometry = self.sources[:, :2] @ noise[:2] + self.bridged
+        return by_odometry, by_odometry + self.sources[:, 2:] @ noise[2:]
+
     def errors(self, turns: Array) -> Array:
         """(M, 2 D): derivatives of turns (M,) rad by the factors and biases of the drives."""
         return np.hstack([self.own * turns[:, None], self.own * -self.time_s[:, None]])
 
-    def summed(self, values: NDArray[Any]) -> NDArray[Any]:
+    def in_short_windows(self, values: NDArray[Any]) -> NDArray[Any]:
         """Sums (W, ...) of steps (M, ...) over short windows."""
         return np.asarray(np.add.reduceat(values, self.short, axis=0))
 
@@ -225,6 +233,12 @@ class _Steps:
         power = float(x @ x) * float(y @ y)
         return float(x @ y / np.sqrt(max(power, _TINY)))
 
+    def _usual_noise(self) -> tuple[Array, Array]:
+        """A to P before any is learned, and standard deviations of their logarithms, (4,)."""
+        if not self.by_gyro:
+            return NOISE, NOISE_SPREAD
+        return np.append(GYRO_NOISE, NOISE[2:]), np.tile(NOISE_SPREAD[2:], 2)
+
     def noise(self, residual: Array, before: Array) -> Array:
         """The likeliest A to P by the `residual` (M,) rad between images and odometry, in steps and
         windows, near those of `before`."""
@@ -235,11 +249,7 @@ class _Steps:
         in_windows = np.add.reduceat(residual, self.windows)[whole]
         squares = np.append(residual[single], in_windows) ** 2
 
-        usual = NOISE.copy()
-        spread = NOISE_SPREAD.copy()
-        if self.by_gyro:
-            usual[:2] = GYRO_NOISE
-            spread[:2] = NOISE_SPREAD[2:]
+        usual, spread = self._usual_noise()
 
         def cost(logarithms: Array) -> tuple[float, Array]:
             noise = np.exp(logarithms)
