@@ -74,29 +74,26 @@ class OdometryTrack:
     ) -> OdometryTrack:
         """From wheel odometry, with the turns of the gyroscope if there is one."""
         stamps = odometry.stamps_ns
-        skipped = Counter[str]()
         if len(stamps) < 2:
             raise DataError('fewer than two usable odometry messages: check the odometry topic')
         breaks = pauses(odometry)
-        skipped['pauses'] += int(breaks.sum())
+        skipped = Counter[str](pauses=int(breaks.sum()))
         breaks |= np.diff(odometry.part) != 0
         yaw = np.unwrap(odometry.poses[:, 2])
         variances = odometry.variances[:, 1]
         poses = np.column_stack([odometry.poses[:, :2], yaw])
-        by_gyro = config.yaw_source != 'odometry' and bool(yaw_rate and len(yaw_rate.stamps_ns) > 1)
-        if by_gyro:
-            assert yaw_rate is not None
+        by_gyro = False
+        if config.yaw_source != 'odometry' and yaw_rate and len(yaw_rate.stamps_ns) > 1:
+            by_gyro = True
             turns, variances = _gyro_turns(odometry, ~breaks, yaw_rate, skipped)
             yaw = yaw[0] + summed(turns)
         elif config.yaw_source == 'gyro':
             raise DataError('yaw_source is gyro, but there is no yaw rate: name the imu topic')
-        dt = np.diff(stamps) * 1e-9
-        stated = variances[:-1] * dt**2
         unsure = bridged(odometry) * [1.0, not by_gyro]
-        noise = np.where(stated > 0, stated, config.yaw_noise**2 * dt) + unsure[:, 1]
+        noise = _yaw_noise(stamps, variances, config.yaw_noise) + unsure[:, 1]
         part = summed(breaks).astype(np.int64)
         count = Count(len(stamps), dict(+skipped))
-        sums = np.vstack([np.zeros(2), np.cumsum(unsure, axis=0)])
+        sums = np.pad(np.cumsum(unsure, axis=0), ((1, 0), (0, 0)))
         return cls(stamps, poses, part, summed(noise), count, sums, by_gyro)._turned(yaw)
 
     @property
@@ -200,6 +197,14 @@ def bridged(odometry: Odometry) -> Array:
 
 def _paused(dt: Array) -> Mask:
     return np.asarray(dt > max(GAP_MAX_S, _PERIODS * float(np.median(dt))))
+
+
+def _yaw_noise(stamps_ns: Stamps, variances: Array, noise: float) -> Array:
+    """Variances (N - 1,) rad^2 of the turns by those of their rates (N,), or by `noise`,
+    rad/sqrt(s), where these are not stated."""
+    dt = np.diff(stamps_ns) * 1e-9
+    stated = variances[:-1] * dt**2
+    return np.where(stated > 0, stated, noise**2 * dt)
 
 
 def _gyro_turns(

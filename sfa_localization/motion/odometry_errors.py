@@ -59,21 +59,9 @@ def way_of(
     clock of the odometry. Images of a map that was learned with the way `before` show another loss,
     but no other scale.
     """
-    seconds = track.seconds
-    time_s = (stamps_ns - track.stamps_ns[0]) * 1e-9
-    part = track.part[np.searchsorted(seconds, time_s, 'right') - 1]
-    rows = spaced(np.interp(time_s, seconds, track.length), STEP_M)
-    whole = part[rows[:-1]] == part[rows[1:]]
-    first = rows[:-1][whole]
-    last = rows[1:][whole]
-    if len(first) < PAIRS_MIN:
+    moved, ways = _displacements(track, stamps_ns, poses)
+    if len(moved) < PAIRS_MIN:
         return None
-    turn = np.exp(1j * (poses[:, 2] - np.interp(time_s, seconds, track.yaw)))
-    turn = np.exp(1j * np.angle(turn[first] + turn[last]))
-    driven = np.column_stack([np.interp(time_s, seconds, summed(way)) for way in track.ways().T])
-    ways = turn[:, None] * (driven[last] - driven[first])
-    places = poses[:, 0] + 1j * poses[:, 1]
-    moved = places[last] - places[first]
     way = _fitted(moved, ways, OFFSET_STD)
     if not _is_clear(way.offset):
         way = _fitted(moved, ways, 0.0)
@@ -86,6 +74,26 @@ def way_of(
         way = way.scaled(scale / way.scale)
     clear = _is_clear(way.loss) or _is_clear(way.offset)
     return way if clear and abs(way.loss.value) < LARGEST_LOSS else None
+
+
+def _displacements(
+    track: OdometryTrack, stamps_ns: Stamps, poses: Array
+) -> tuple[Complex, Complex]:
+    """Displacements (K,) m between images that are STEP_M apart without a break, by their `poses`
+    (M, 3), and those of `OdometryTrack.ways` (K, 3), in the frame of the map.
+    """
+    seconds = track.seconds
+    time_s = (stamps_ns - track.stamps_ns[0]) * 1e-9
+    part = track.part[np.searchsorted(seconds, time_s, 'right') - 1]
+    rows = spaced(np.interp(time_s, seconds, track.length), STEP_M)
+    whole = part[rows[:-1]] == part[rows[1:]]
+    first = rows[:-1][whole]
+    last = rows[1:][whole]
+    turn = np.exp(1j * (poses[:, 2] - np.interp(time_s, seconds, track.yaw)))
+    turn = np.exp(1j * np.angle(turn[first] + turn[last]))
+    driven = np.column_stack([np.interp(time_s, seconds, summed(way)) for way in track.ways().T])
+    places = poses[:, 0] + 1j * poses[:, 1]
+    return places[last] - places[first], turn[:, None] * (driven[last] - driven[first])
 
 
 def _is_clear(error: Quantity) -> bool:
