@@ -81,8 +81,9 @@ class Textures:
 
     def take(self, rows: NDArray[Any]) -> Textures:
         """Some of the images, by a mask (S,) or indices."""
-        parts = self.textures[rows], self.images[rows], self.run[rows], self.path_m[rows]
-        return Textures(*parts, self.seen)
+        return Textures(
+            self.textures[rows], self.images[rows], self.run[rows], self.path_m[rows], self.seen
+        )
 
     def near(self, row: int, rows: Indices) -> NDArray[np.bool_]:
         """Which of the images `rows` (M,) are of the same stretch of driving as another one."""
@@ -150,21 +151,19 @@ def find_closures(views: Textures, clockwise: bool) -> Closures:
     search = ImageSearch(views)
     rows = np.arange(len(views.images))
     numbers, drive = np.unique(views.run, return_inverse=True)
-    likest, shifts = np.zeros((2, len(numbers), len(rows)))
-    likest = likest.astype(np.int64)
-    scores = np.full(likest.shape, -np.inf)
+    # Of each drive and image the row that is likest, its correlation, and its shift.
+    best = np.tile([0.0, -np.inf, 0.0], (len(numbers), len(rows), 1))
     for number in range(len(numbers)):
         for row in rows.tolist():
             others = search.candidates(row, np.flatnonzero(drive == number))
             if len(others):
                 score, shift = search.correlate(row, others)
                 top = score.argmax()
-                likest[number, row] = others[top]
-                scores[number, row] = score[top]
-                shifts[number, row] = shift[top]
+                best[number, row] = others[top], score[top], shift[top]
+    likest = best[:, :, 0].astype(np.int64)
     back = likest[drive, likest]
-    kept = (scores >= LIKE) & (np.abs(back - rows) <= 1) & (rows < likest)
+    kept = (best[:, :, 1] >= LIKE) & (np.abs(back - rows) <= 1) & (rows < likest)
     first = np.broadcast_to(rows, kept.shape)[kept]
     pairs = views.images[np.column_stack([first, likest[kept]])]
     step = (2 if clockwise else -2) * np.pi / views.textures.shape[2]
-    return Closures(pairs, step * shifts[kept])
+    return Closures(pairs, step * best[kept, 2])

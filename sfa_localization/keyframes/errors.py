@@ -83,9 +83,9 @@ class LeftOut:
     @classmethod
     def of(cls, fits: Sequence[Fit], poses: Array, weight: Array) -> LeftOut:
         """By the true poses (M, 3)."""
-        numbers = np.array([[fit.unlike, fit.outward, fit.variance, fit.yaw] for fit in fits])
+        numbers = [[fit.unlike, fit.outward, fit.variance, fit.yaw] for fit in fits]
+        unlike, outward, variance, yaw = np.array(numbers).T
         error = np.array([fit.place for fit in fits]) - poses[:, :2]
-        unlike, outward, variance, yaw = numbers.T
         return cls(unlike, outward, variance, error, wrap_angle(yaw - poses[:, 2]), weight)
 
     def learn(self) -> ErrorModel:

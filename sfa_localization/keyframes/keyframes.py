@@ -81,9 +81,17 @@ class Keyframes:
         if len(poses) < FEWEST:
             raise DataError(f'{len(poses)} images are too few for keyframes')
         values, step = encoded(textures, poses, sphere, seen)
-        columns = textures.shape[2]
-        trained = int(lights.max()) + 1
-        return cls(values, step, columns, poses, ErrorModel(), sphere, lights, trained, seen)
+        return cls(
+            values,
+            step,
+            textures.shape[2],
+            poses,
+            ErrorModel(),
+            sphere,
+            lights,
+            int(lights.max()) + 1,
+            seen,
+        )
 
     def take(self, rows: NDArray[Any]) -> Keyframes:
         """Some of the keyframes, by a mask (K,) or indices."""
@@ -132,9 +140,8 @@ class Keyframes:
         """The lights of the training that the likeliest keyframes are of, by correlations (K,)."""
         lights, counts = np.unique(self.lights[self.first], return_counts=True)
         # Lights of which too few keyframes are there count where no other one does.
-        lights = lights[counts >= min(FEWEST, counts.max(initial=0))]
-        best = [-scores[self.lights == light].max() for light in lights.tolist()]
-        return list(lights[np.argsort(best, kind='stable')[:LIGHTS]].tolist())
+        enough: list[int] = lights[counts >= min(FEWEST, counts.max(initial=0))].tolist()
+        return sorted(enough, key=lambda light: -scores[self.lights == light].max())[:LIGHTS]
 
     def around(self, place: Array, light: int) -> Indices:
         """The keyframes of the regression about a place (2,) m: the nearest of a light of the
@@ -164,19 +171,27 @@ class Keyframes:
         slopes = spectrum(derivatives(columns_of(image, self.columns), self.channels, self.sphere))
         by_turn = image * (1j * np.arange(image.shape[1])).astype(np.complex64)
         changes = turned(np.concatenate([image[None], slopes, by_turn[None]]), self.sign * yaw)
-        places = self.poses[rows, :2]
-        lights = self.lights[rows]
         keyframes = self.aligned(rows)
         if self.seen is not None:
             seen = turned_mask(self.seen, self.sign * yaw)
             changes = masked(changes, seen)
             keyframes = masked(keyframes, seen)
-        fit = regress(changes, keyframes, places, lights, self.channels, self.columns)
+        fit = regress(
+            changes,
+            keyframes,
+            self.poses[rows, :2],
+            self.lights[rows],
+            self.channels,
+            self.columns,
+        )
         facing = complex(fit.shares @ np.exp(1j * self.poses[rows, 2]))
         turn = float(fit.changes[2])
-        yaw = yaw - self.sign * turn
-        residual = turned(fit.residual, -turn)
-        return dataclasses.replace(fit, yaw=yaw, facing=facing, residual=residual)
+        return dataclasses.replace(
+            fit,
+            yaw=yaw - self.sign * turn,
+            facing=facing,
+            residual=turned(fit.residual, -turn),
+        )
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to save, without pickle."""
@@ -189,15 +204,17 @@ class Keyframes:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]], sphere: Sphere) -> Keyframes:
         """Read the arrays of `to_arrays`, of panoramas that show so much of the `sphere`."""
-        values = np.asarray(arrays['values'], np.int8)
-        step = float(arrays['step'])
-        poses = arrays['poses'].astype(float)
-        lights = arrays['drives'].astype(np.int32)
-        errors = ErrorModel(*arrays['errors'].astype(float).tolist())
-        columns = int(arrays['columns'])
-        trained = int(arrays['trained'])
-        seen = np.asarray(arrays['seen'], bool) if 'seen' in arrays else None
-        return cls(values, step, columns, poses, errors, sphere, lights, trained, seen)
+        return cls(
+            np.asarray(arrays['values'], np.int8),
+            float(arrays['step']),
+            int(arrays['columns']),
+            arrays['poses'].astype(float),
+            ErrorModel(*arrays['errors'].astype(float).tolist()),
+            sphere,
+            arrays['drives'].astype(np.int32),
+            int(arrays['trained']),
+            np.asarray(arrays['seen'], bool) if 'seen' in arrays else None,
+        )
 
 
 def encoded(

@@ -149,11 +149,13 @@ def tilt_pairs(views: Textures, sphere: Sphere) -> TiltPairs:
         if not len(others):
             continue
         turn = search.correlate(row, others)[1] * (2 * np.pi / columns)
-        of_others = search.spectra[others], turn, columns, channels(height), sphere
-        tilts, scores = find_tilt(search.spectra[row], *of_others)
+        tilts, scores = find_tilt(
+            search.spectra[row], search.spectra[others], turn, columns, channels(height), sphere
+        )
         heading = turn if sphere.clockwise else -turn
         pair = np.column_stack([np.full(len(others), row), others, tilts, heading])
         pairs.append(pair[scores >= LIKE])
     first, second, roll, pitch, heading = np.concatenate(pairs).T
-    indices = first.astype(np.int64), second.astype(np.int64)
-    return TiltPairs(*indices, roll + 1j * pitch, np.exp(1j * heading))
+    return TiltPairs(
+        first.astype(np.int64), second.astype(np.int64), roll + 1j * pitch, np.exp(1j * heading)
+    )

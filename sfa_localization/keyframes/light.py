@@ -49,7 +49,7 @@ class Conditions:
         # At the border of the keyframes the residual is also due to the place.
         if fit.outward > BORDER or np.hypot(*(place - self._last)) < _SPACING_M:
             return
-        self._places = self._places + 1
+        self._places += 1
         self._last = place
         share = np.float32(1 / min(self._places + _BEFORE, _AVERAGED))
         before = np.zeros_like(fit.residual) if self.pattern is None else self.pattern

@@ -25,7 +25,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -92,54 +91,49 @@ def located(
     and their variances (H,) m^2 along each axis by the map; `scales` (S,) are the probabilities of
     `SCALES` by the images before, `tilt` (2,) that of the image.
     """
-    mixture = _Mixture.of(fits, slow, scales, errors)
-    weight = mixture.weight
+    weight, means, variance = _mixture(fits, slow, scales, errors)
     by_fit = weight.sum(axis=1)
     unlike, yaws, starts = np.array([(f.unlike, f.yaw, f.start) for f in fits]).T
     here = starts == np.bincount(starts.astype(int), by_fit).argmax()
     near = np.where(here[:, None], weight, 0.0) / by_fit[here].sum()
-    place = np.tensordot(near, mixture.means, 2)
+    place = np.tensordot(near, means, 2)
     of_fit = near.sum(axis=1)
     yaw = float(np.angle(of_fit @ np.exp(1j * yaws)))
     # The covariance of position and heading omits the other hypotheses.
     covariance = np.zeros((3, 3))
-    offset = mixture.means - place
+    offset = means - place
     covariance[:2, :2] = np.einsum('hs,hsi,hsj->ij', weight, offset, offset)
-    covariance[:2, :2] += mixture.variance * np.eye(2)
+    covariance[:2, :2] += variance * np.eye(2)
     covariance[2, 2] = by_fit @ (wrap_angle(yaws - yaw) ** 2 + errors.yaw_variance(unlike))
-    fit = fits[int(of_fit.argmax())]
-    pose = np.array([*place, wrap_angle(yaw)])
-    facing = complex(of_fit @ np.array([f.facing for f in fits]))
-    return Location(pose, covariance, fit, facing, weight.sum(axis=0), tilt)
+    return Location(
+        np.array([*place, wrap_angle(yaw)]),
+        covariance,
+        fits[int(of_fit.argmax())],
+        complex(of_fit @ np.array([f.facing for f in fits])),
+        weight.sum(axis=0),
+        tilt,
+    )
 
 
-class _Mixture(NamedTuple):
-    """Terms of H hypotheses at S scales, with the `weight` (H, S) of sum 1 and the `means`
-    (H, S, 2) m, and their mean `variance`, m^2 per axis.
+def _mixture(
+    fits: Sequence[Fit], slow: tuple[Array, Array], scales: Array, errors: ErrorModel
+) -> tuple[Array, Array, float]:
+    """Weights (H, S) of sum 1 and means (H, S, 2) m of the terms of `located`, and the mean of
+    their variances, m^2 per axis.
     """
-
-    weight: Array
-    means: Array
-    variance: float
-
-    @classmethod
-    def of(
-        cls, fits: Sequence[Fit], slow: tuple[Array, Array], scales: Array, errors: ErrorModel
-    ) -> _Mixture:
-        """See `located`."""
-        numbers = [(f.variance, f.outward, f.unlike, f.evidence) for f in fits]
-        by_residual, outward, unlike, evidence = np.array(numbers).T
-        places = np.array([f.place for f in fits])
-        by_keyframes = errors.variance(by_residual, outward, unlike)[:, None]
-        by_slow = errors.slow_variance(slow[1], unlike)[:, None]
-        total = by_keyframes + by_slow * SCALES
-        gain = by_keyframes / total
-        difference = slow[0] - places
-        joint = evidence[:, None] + np.log(scales) - np.log(total)
-        joint -= (difference**2).sum(1)[:, None] / (2 * total)
-        weight = special.softmax(joint)
-        means = places[:, None] + gain[:, :, None] * difference[:, None]
-        return cls(weight, means, float((weight * by_keyframes * (1 - gain)).sum()))
+    by_residual, outward, unlike, evidence = np.array(
+        [(f.variance, f.outward, f.unlike, f.evidence) for f in fits]
+    ).T
+    places = np.array([f.place for f in fits])
+    by_keyframes = errors.variance(by_residual, outward, unlike)[:, None]
+    total = by_keyframes + errors.slow_variance(slow[1], unlike)[:, None] * SCALES
+    gain = by_keyframes / total
+    difference = slow[0] - places
+    joint = evidence[:, None] + np.log(scales) - np.log(total)
+    joint -= (difference**2).sum(1)[:, None] / (2 * total)
+    weight = special.softmax(joint)
+    means = places[:, None] + gain[:, :, None] * difference[:, None]
+    return weight, means, float((weight * by_keyframes * (1 - gain)).sum())
 
 
 def _from_starts(keyframes: Keyframes, image: UprightImage, pattern: Spectra | None) -> list[Fit]:

@@ -70,8 +70,7 @@ def find_offsets(views: Textures, poses: Array, sphere: Sphere) -> Offsets:
             continue
         fit = keyframes.fit(keyframes.spectrum(row), poses[row, 2], near)
         if fit.unlike < _UNLIKE:
-            # Fewer neighbors are filled up with some of no share.
-            missing = (0, NEIGHBORS - len(near))
+            missing = (0, NEIGHBORS - len(near))  # filled up with neighbors of no share
             others = np.pad(near, missing, constant_values=near[0])
             shares = np.pad(fit.shares, missing)
             turn = np.pad(fit.yaw - poses[near, 2], missing)
@@ -86,8 +85,9 @@ def _spaced(path_m: Array, yaw: Array, drives: NDArray[np.int32]) -> list[int]:
     """Rows of views (S,) in driving order, each so far from the one before, or turned so far."""
     rows = [0]
     for row in range(1, len(path_m)):
-        way = path_m[row] - path_m[rows[-1]]
-        turned = abs(wrap_angle(yaw[row] - yaw[rows[-1]]))
-        if drives[row] != drives[rows[-1]] or way >= _SPACING_M or turned >= _SPACING_RAD:
+        last = rows[-1]
+        way = path_m[row] - path_m[last]
+        turned = abs(wrap_angle(yaw[row] - yaw[last]))
+        if drives[row] != drives[last] or way >= _SPACING_M or turned >= _SPACING_RAD:
             rows.append(row)
     return rows

@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,16 +103,16 @@ def regress(
     scale[:, count:] /= gains[:, None]
     products *= scale[:, :, None] * scale[:, None]
     trust = _trust(gains, products, basis, heights)
-    found = _regression(np.tensordot(trust, products, 1), basis)
-    by_row = np.repeat(found.combinations[:, None] * scale, heights, axis=1).astype(np.float32)
+    combinations, shares, unlike = _regression(np.tensordot(trust, products, 1), basis)
+    by_row = np.repeat(combinations[:, None] * scale, heights, axis=1).astype(np.float32)
     residual, *directions = np.einsum('crn,nrf->crf', by_row, spectra, optimize=True)
     trust_of_rows, gain_of_rows = np.repeat([trust, gains], heights, axis=1).astype(np.float32)
     variance = _variance(residual, directions, trust_of_rows, columns)
-    place = found.shares @ places
-    changes = -found.combinations[0, count + 1 :]
+    place = shares @ places
+    changes = -combinations[0, count + 1 :]
     residual = residual * gain_of_rows[:, None]
     outward = _outward(places - place)
-    return Fit(place, found.shares, changes, found.unlike, residual, variance, outward)
+    return Fit(place, shares, changes, unlike, residual, variance, outward)
 
 
 def _outward(offset: Array) -> float:
@@ -123,15 +122,10 @@ def _outward(offset: Array) -> float:
 
 def _products(spectra: Spectra, channels: Sequence[slice], columns: int) -> Array:
     """Products (C, n, n) of n textures by channel, of their spectra (n, rows, F)."""
-    weighted = spectra * _root_weights(spectra.shape[2], columns)
+    once = 2 * np.arange(spectra.shape[2]) % columns == 0
+    weighted = spectra * np.sqrt(np.where(once, 1, 2) / columns).astype(np.float32)
     parts = (weighted[:, part].reshape(len(spectra), -1).view(np.float32) for part in channels)
     return np.stack([part @ part.T for part in parts]).astype(float)
-
-
-def _root_weights(frequencies: int, columns: int) -> Texture:
-    """Square roots of the weights (F,) of spectra, whose products are then those of textures."""
-    once = 2 * np.arange(frequencies) % columns == 0
-    return np.asarray(np.sqrt(np.where(once, 1, 2) / columns), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,26 +175,18 @@ def _likest(scores: Array) -> Array:
 
 def _trust(gains: Array, products: Array, basis: _Basis, heights: Sequence[int]) -> Array:
     """How much each channel (C,) counts, 1 at most: by how well the keyframes explain it."""
-    residual = _regression(np.tensordot(gains**2, products, 1), basis).combinations[0]
+    residual = _regression(np.tensordot(gains**2, products, 1), basis)[0][0]
     errors = (products @ residual) @ residual / heights
     trust = 1 / (errors + errors.min() + 1e-12)
     return np.asarray(trust / trust.max())
 
 
-class _Regression(NamedTuple):
-    """By n = N + 1 + M textures, of N keyframes, the image, and M changes by roll, pitch and
-    heading: the `combinations` (3, n) of these that are the residual of the image and the two
-    directions along which it moves the place; the `shares` (N,) of the keyframes; and
-    `Fit.unlike`.
+def _regression(products: Array, basis: _Basis) -> tuple[Array, Array, float]:
+    """The regression by the products (n, n), n = N + 1 + M, of N keyframes, the image, and M
+    changes by roll, pitch and heading: the combinations (3, n) of these that are the residual of
+    the image and the two directions along which it moves the place; the shares (N,) of the
+    keyframes; and `Fit.unlike`.
     """
-
-    combinations: Array
-    shares: Array
-    unlike: float
-
-
-def _regression(products: Array, basis: _Basis) -> _Regression:
-    """The regression by the products (n, n) of all textures."""
     count = len(basis.mean)
     nuisance = basis.nuisance(len(products))
     within = nuisance @ products @ nuisance.T
@@ -208,7 +194,7 @@ def _regression(products: Array, basis: _Basis) -> _Regression:
     gram = residuals @ products @ residuals.T
     root = np.sqrt(basis.weight)[:, None]
     system = gram[:-1, :-1] * root * root.T
-    system += max(_RIDGE * float(system.trace()), 1e-12) * np.eye(count)
+    system += max(_RIDGE * system.trace(), 1e-12) * np.eye(count)
     targets = np.column_stack([-gram[:-1, -1], basis.centered @ basis.places]) * root
     solution = (np.linalg.solve(system, targets) * root).T
     combinations = solution @ residuals[:-1]
@@ -219,7 +205,7 @@ def _regression(products: Array, basis: _Basis) -> _Regression:
     unexplained = max(combinations[0] @ products @ combinations[0] / square, 0.0)
     unlike = (unexplained + _TINY) / (likeness**2 + _TINY**2)
     shares = basis.mean - solution[0] @ basis.centered
-    return _Regression(combinations, shares, float(unlike))
+    return combinations, shares, float(unlike)
 
 
 def _residuals(nuisance: Array, within: Array, products: Array, basis: _Basis) -> Array:

@@ -44,9 +44,9 @@ def derivatives(texture: Texture, channels: Sequence[slice], sphere: Sphere) -> 
     upward = []
     elevations = []
     for part in channels:
-        elevations.append(sphere.elevations(part.stop - part.start))
-        step = (sphere.low - sphere.high) / len(elevations[-1])
-        upward.append(np.gradient(texture[part], step, axis=0))
+        count = part.stop - part.start
+        elevations.append(sphere.elevations(count))
+        upward.append(np.gradient(texture[part], (sphere.low - sphere.high) / count, axis=0))
     sideways = np.roll(texture, -1, 1) - np.roll(texture, 1, 1)
     sideways = sideways * np.tan(np.concatenate(elevations))[:, None]
     sideways *= (-1 if sphere.clockwise else 1) * columns / (4 * np.pi)

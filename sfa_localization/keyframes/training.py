@@ -54,10 +54,10 @@ def choose_keyframes(
     order = order[np.argsort(cell[order], kind='stable')]
     rank = np.arange(len(order)) - np.searchsorted(cell[order], cell[order])
     rows = np.sort(order[np.argsort(rank, kind='stable')[:number]])
-    keyframes = Keyframes.of(
+    chosen = Keyframes.of(
         textures[rows], np.asarray(poses[rows], float), sphere, drives[rows], seen
     )
-    return _by_light(keyframes), rows
+    return _by_light(chosen), rows
 
 
 def located_without(
@@ -77,7 +77,7 @@ def located_without(
             difference = keyframes.poses[others, :2] - keyframes.poses[row, :2]
             rows.append(row)
             fits.append(fit)
-            nearest.append(float(np.hypot(*difference.T).min()))
+            nearest.append(np.hypot(*difference.T).min())
     return np.array(rows, np.int64), fits, np.array(nearest)
 
 
@@ -97,9 +97,10 @@ def fit_among(keyframes: Keyframes, row: int, among: NDArray[np.bool_]) -> Fit |
     if scores[best] < LIKE_A_PLACE:
         return None
     place = others.poses[best, :2]
-    yaw = float(yaws[best])
-    lights = others.likeliest_lights(scores)
-    fits = [others.fit_about(image, place, yaw, light) for light in lights]
+    fits = [
+        others.fit_about(image, place, float(yaws[best]), light)
+        for light in others.likeliest_lights(scores)
+    ]
     return min(fits, key=lambda fit: fit.unlike, default=None)
 
 
@@ -120,8 +121,8 @@ def _of_light(keyframes: Keyframes, rows: Indices, of_light: NDArray[np.bool_]) 
     """The part of the keyframes `rows` that is the same residual everywhere when they are fitted
     among those of a light: 0 in the same light, more in another; 1 where they do not meet.
     """
-    compared = rows[evenly(len(rows), _COMPARED)].tolist()
-    fits = [fit_among(keyframes, row, of_light) for row in compared]
+    compared = rows[evenly(len(rows), _COMPARED)]
+    fits = [fit_among(keyframes, row, of_light) for row in compared.tolist()]
     residuals = [fit.residual for fit in fits if fit is not None and fit.outward <= BORDER]
     if len(residuals) < _FEWEST:
         return 1.0

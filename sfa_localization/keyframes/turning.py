@@ -10,8 +10,6 @@ and no wheels, so that it tells a lever arm from wheels that slip in turns.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy import linalg
 from scipy.ndimage import minimum_filter1d
@@ -47,10 +45,14 @@ def lever_square(views: Textures, yaw: Array) -> Quantity | None:
     """|l|^2, m^2, with its standard deviation by the scatter, by views with headings (S,) rad of
     odometry; None where there are too few turns, or no way to compare them with.
     """
-    pairs = _pairs(views, yaw)
-    if min(len(each.size) for each in pairs) < _FEWEST:
+    pairs, way, turn = _pairs(views, yaw)
+    spot = (way < SPOT_M) & _within(turn, TURNS_RAD)
+    ahead = (turn < STRAIGHT_RAD) & _within(way, AHEAD_M)
+    if min(spot.sum(), ahead.sum()) < _FEWEST:
         return None
-    turned, driven = (_medians(views, each) for each in pairs)
+    chord = np.abs(np.exp(1j * turn[spot]) - 1) ** 2
+    turned = _medians(views, pairs[:, spot], chord)
+    driven = _medians(views, pairs[:, ahead], way[ahead] ** 2)
     sizes = linalg.block_diag(turned[:, :1], driven[:, :1])
     rows = np.column_stack([np.ones(len(sizes)), sizes])
     changes = np.concatenate([turned[:, 1], driven[:, 1]])
@@ -64,39 +66,30 @@ def lever_square(views: Textures, yaw: Array) -> Quantity | None:
     return Quantity(max(by_turn, 0.0) / by_way, float(std) / by_way)
 
 
-class _Pairs(NamedTuple):
-    """Pairs (P,) of images, and the `size`, m^2, of the square of a turn or way between both."""
-
-    first: Indices
-    last: Indices
-    size: Array
+def _within(values: Array, bounds: tuple[float, float]) -> Mask:
+    """Which values lie between both bounds."""
+    return np.asarray((values > bounds[0]) & (values < bounds[1]))
 
 
-def _pairs(views: Textures, yaw: Array) -> tuple[_Pairs, _Pairs]:
-    """Pairs between which the robot turned on the spot, and between which it drove ahead."""
+def _pairs(views: Textures, yaw: Array) -> tuple[Indices, Array, Array]:
+    """Pairs (2, P) of neighboring images of a drive, way, m, and turn, rad, between both."""
     lags = range(1, _LAGS + 1)
     first = np.concatenate([np.arange(len(yaw) - lag) for lag in lags])
     last = np.concatenate([np.arange(lag, len(yaw)) for lag in lags])
-    same = views.run[first] == views.run[last]
-    way = views.path_m[last] - views.path_m[first]
-    turn = np.abs(yaw[last] - yaw[first])
-    spot = same & (way < SPOT_M) & (turn > TURNS_RAD[0]) & (turn < TURNS_RAD[1])
-    ahead = same & (turn < STRAIGHT_RAD) & (way > AHEAD_M[0]) & (way < AHEAD_M[1])
-    chord = np.abs(np.exp(1j * turn[spot]) - 1)
-    turned = _Pairs(first[spot], last[spot], chord**2)
-    return turned, _Pairs(first[ahead], last[ahead], way[ahead] ** 2)
+    pairs = np.array([first, last])[:, views.run[first] == views.run[last]]
+    return pairs, np.diff(views.path_m[pairs], axis=0)[0], np.abs(np.diff(yaw[pairs], axis=0)[0])
 
 
-def _medians(views: Textures, pairs: _Pairs) -> Array:
-    """Of pairs of textures, in groups of one size, the medians of that and of their change
-    (groups, 2): minus the logarithm of their correlation at low frequencies, turned to be most
-    alike.
+def _medians(views: Textures, pairs: Indices, size: Array) -> Array:
+    """Of pairs (2, P) of textures, in groups of one size (P,), the medians of that and of their
+    change (groups, 2): minus the logarithm of their correlation at low frequencies, turned to be
+    most alike.
     """
-    rows = evenly(len(pairs.size), _MOST)
-    size = pairs.size[rows]
+    rows = evenly(len(size), _MOST)
+    size = size[rows]
     textures = views.textures
     columns = textures.shape[2]
-    used, chosen = np.unique([pairs.first[rows], pairs.last[rows]], return_inverse=True)
+    used, pairs = np.unique(pairs[:, rows], return_inverse=True)
     low = spectra_of(textures[used])
     low[:, :, [0, *range(FREQUENCIES + 1, low.shape[2])]] = 0
     norm = np.linalg.norm(low, axis=(1, 2), keepdims=True) * np.sqrt(2 / columns)
@@ -104,7 +97,7 @@ def _medians(views: Textures, pairs: _Pairs) -> Array:
     seen = views.seen
     if seen is not None:  # without that into which low frequencies carry what was not seen
         seen = minimum_filter1d(seen, 1 + columns // FREQUENCIES, mode='wrap')
-    likeness = [_likeness(low[a], low[[b]], columns, seen) for a, b in chosen.reshape(2, -1).T]
+    likeness = [_likeness(low[a], low[[b]], columns, seen) for a, b in pairs.reshape(2, -1).T]
     change = -np.log(np.maximum(np.array(likeness, np.float32), 0.05))
     groups = np.array_split(np.argsort(size, kind='stable'), _GROUPS)
     return np.array([[np.median(size[group]), np.median(change[group])] for group in groups])

@@ -91,8 +91,9 @@ def _compared(
     whole = part = spectrum(image)
     if tilt.any() or keyframes.seen is not None:
         heights = [channel.stop - channel.start for channel in keyframes.channels]
-        masks = [visible(tilt, n, keyframes.columns, keyframes.sphere) for n in heights]
-        mask = np.concatenate(masks)
+        mask = np.concatenate(
+            [visible(tilt, n, keyframes.columns, keyframes.sphere) for n in heights]
+        )
         if keyframes.seen is not None:
             mask = mask & keyframes.seen
         part = correlated_part(image, mask)
@@ -109,7 +110,9 @@ def _leveled(keyframes: Keyframes, image: UprightImage) -> UprightImage:
     likest = np.argsort(-image.scores, kind='stable')[:_LEVELED]
     likest = likest[np.isfinite(image.scores[likest])]
     turn = -keyframes.sign * image.yaws[likest].astype(float)
-    of_keyframes = keyframes.columns, keyframes.channels, keyframes.sphere
     seen = image.spectrum if keyframes.seen is None else masked(image.spectrum, keyframes.seen)
-    tilts, scores = find_tilt(seen, keyframes.aligned(likest), turn, *of_keyframes)
+    others = keyframes.aligned(likest)
+    tilts, scores = find_tilt(
+        seen, others, turn, keyframes.columns, keyframes.channels, keyframes.sphere
+    )
     return without(keyframes, image, tilts[int(scores.argmax())])

@@ -84,6 +84,7 @@ class Drives:
     once, if not given."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, 'mount', self.mount.of(len(self.items)))
         if not self.tracks:
             object.__setattr__(self, 'tracks', tuple(self._estimated_tracks()))
 
@@ -123,26 +124,25 @@ class Drives:
         Raises DataError.
         """
         ways = ways or [None] * len(self.items)
-        mount = self.mount.of(len(self.items))
         parts = []
         for track, way, drive in zip(self.tracks, ways, self.items, strict=True):
-            track = replace(track.driven(way) if way else track, lever=mount.lever)
+            track = replace(track.driven(way) if way else track, lever=self.mount.lever)
             parts.append(cut_track(track, drive.stamps_ns, self.config))
         offsets = self.offsets.of_robot(self._camera_yaw)
-        joined = replace(join(parts, self.starts), ways=tuple(ways), mount=mount, offsets=offsets)
+        joined = join(parts, self.starts)
+        joined = replace(joined, ways=tuple(ways), mount=self.mount, offsets=offsets)
         segments = with_closures(joined, self.closures.of_robot(self._camera_yaw))
         if self.points is None:
             return segments
         drives = [(drive.run.odometry, drive.stamps_ns) for drive in self.items]
         images = np.concatenate([one.images for one in segments])
-        points = MeasuredPoints.of(self.points, drives, images, settled, mount.lever)
+        points = MeasuredPoints.of(self.points, drives, images, settled, self.mount.lever)
         return replace(segments, points=points)
 
     @property
     def _camera_yaw(self) -> Array:
         """Yaw of the camera on the robot, rad, of each image (N,)."""
-        yaw = self.mount.of(len(self.items)).yaw
-        return np.repeat(yaw, [len(drive.run.panoramas) for drive in self.items])
+        return np.repeat(self.mount.yaw, [len(drive.run.panoramas) for drive in self.items])
 
     def measured(self, views: Textures, sphere: Sphere) -> Drives:
         """With the offsets of `views`, near the poses of the graph of odometry and closures, and
@@ -163,7 +163,7 @@ class Drives:
         drives = replace(drives, mount=Graph.of(drives.cut()).mount)
         if drives.mount.contradiction:
             logger.warning(drives.mount.contradiction)
-        for drive, yaw in zip(drives.items, drives.mount.of(len(drives.items)).yaw, strict=True):
+        for drive, yaw in zip(drives.items, drives.mount.yaw, strict=True):
             if abs(yaw) > MOUNTED_ANEW_RAD:
                 logger.warning(
                     '%s: its camera is turned by %.1f degrees against %s: the headings of images '

@@ -116,7 +116,10 @@ class Mount:
         share = np.array([1.0, 0.0])
         if self.given is None:
             share = special.softmax(evidence + [self._by_turns(lever) for lever in levers])
-        mean, spread = _mixed(share, means, spreads)
+        mean = share @ means
+        deviations = means - mean
+        spread = np.einsum('p,pij->ij', share, spreads)
+        spread += np.einsum('p,pi,pj->ij', share, deviations, deviations)
         # Without the slip, and with the yaw in the first drive.
         stated = np.delete(np.eye(len(gradient)), (2, 3), axis=0)[:, free]
         return replace(
@@ -189,11 +192,3 @@ def _posterior(prior: Array, information: Array, pull: Array) -> tuple[Array, Ar
     mean = spread @ pull
     size = np.linalg.slogdet(spread)[1] - np.log(prior).sum()
     return mean, spread, (size + pull @ mean) / 2
-
-
-def _mixed(share: Array, means: Array, spreads: Array) -> tuple[Array, Array]:
-    """Mean (n,) and covariance (n, n) of a mixture of P normal distributions by shares (P,)."""
-    mean = share @ means
-    deviations = means - mean
-    spread = np.einsum('p,pij->ij', share, spreads)
-    return mean, spread + np.einsum('p,pi,pj->ij', share, deviations, deviations)

@@ -82,16 +82,13 @@ def _lines(path: Path) -> Iterator[tuple[int, int | None, int, complex, float]]:
         cells = re.split(r'\s*[,;]\s*|\s+', line.partition('#')[0].strip())
         if cells == [''] or cells[0] == 'stamp_s':
             continue
+        wrong = DataError(f'{path}: line {number}: {line.strip()!r} is no point: {_USAGE}')
         try:
             stop = int(cells.pop(1)) if cells[0].lower() == 'stop' else None
             stamp_ns = 0 if stop is not None else int(Decimal(cells[0]) * 10**9)
             x, y, std = map(float, [*cells[1:], str(POINT_STD_M)][:3])
         except (ArithmeticError, ValueError, IndexError):
-            stop = None
-            stamp_ns = 0
-            x = math.nan
-            y = math.nan
-            std = math.nan
+            raise wrong from None
         if not (math.isfinite(x + y) and 0 < std < math.inf and len(cells) <= 4):
-            raise DataError(f'{path}: line {number}: {line.strip()!r} is no point: {_USAGE}')
+            raise wrong
         yield number, stop, stamp_ns, complex(x, y), std

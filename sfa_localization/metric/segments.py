@@ -358,10 +358,14 @@ def _segment(poses: ImagePoses, group: Indices, straight: bool) -> Segment:
         path = summed(np.abs(step) * np.where(step.real < 0, -1.0, 1.0)).astype(complex)
         drift = np.zeros(len(group), complex)
     start = np.array([place[0].real, place[0].imag, heading])
-    images = poses.images[group]
-    since_start_s = float(time[0])
     return Segment(
-        images, path, yaw - heading, time - time_s, drift, start, since_start_s=since_start_s
+        poses.images[group],
+        path,
+        yaw - heading,
+        time - time_s,
+        drift,
+        start,
+        since_start_s=float(time[0]),
     )
 
 

@@ -59,7 +59,6 @@ _PRIOR_STD = np.array([1.0, 1.0, 1.0, 0.1])
 _SCALE: Mask = np.array([False, False, False, True])
 # of theta
 _STEP = 0.05
-_CLOSE = 1e-4
 _ROUNDS = 12
 _UNITS = {1.0: '', 100.0: 'centimeters', 1000.0: 'millimeters'}
 
@@ -139,14 +138,13 @@ class _Samples(NamedTuple):
             size = np.abs(found[0])
             std = max(LENGTH_TO_STD * float(np.median(size[self.used])), NOISE_M)
             weight = used / outlier_factor((size / std) ** 2, 2)
-            slopes = self._slopes(theta, free, weight, each * std**2)
-            weighted = slopes.conj().T * (weight / (each * std**2))
+            variance = each * std**2
+            slopes = self._slopes(theta, free, weight, variance)
+            weighted = slopes.conj().T * (weight / variance)
             information = (weighted @ slopes).real + np.diag(1 / _PRIOR_STD**2)
             pulled = (theta - [0, 0, about_s, 0]) / _PRIOR_STD**2
             step = np.linalg.solve(information, -(weighted @ found[0]).real - pulled)
             theta = theta + np.clip(step, -0.5, 0.5) * free
-            if np.abs(step).max() < _CLOSE:
-                break
         return theta, std, *found
 
     def _slopes(self, theta: Array, free: Mask, weight: Array, variance: float) -> Complex:
@@ -225,7 +223,7 @@ class _Comparison:
         places = self.places[rows].conj() if mirrored else self.places[rows]
         samples = _Samples(self, places, self.seconds[rows], self._windows(at[inside]), used)
         theta, std, residual, match, spread = samples.settled(theta, free, about_s)
-        drove = (spread > (self.window_m / 10) ** 2) & (match != 0)
+        drove = spread > (self.window_m / 10) ** 2
         if drove.sum() < WINDOWS_MIN:
             return None
         turns = np.where(drove, np.exp(1j * np.angle(match)), 0)

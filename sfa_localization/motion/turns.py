@@ -171,10 +171,18 @@ class _Steps:
             np.append(0, np.flatnonzero(np.diff(summed(way_m)[:-1] // length + drive / 2)) + 1)
             for length in (FOLLOWED_M, REACH_M)
         )
-        more = np.asarray(wrap_angle(images - odometry))
-        by_gyro = all(drive.by_gyro for drive in drives)
-        given = sources, steps('bridged'), unbroken, short, windows, by_gyro
-        return cls(odometry, more, own, time_s, *given)
+        return cls(
+            odometry,
+            wrap_angle(images - odometry),
+            own,
+            time_s,
+            sources,
+            steps('bridged'),
+            unbroken,
+            short,
+            windows,
+            all(drive.by_gyro for drive in drives),
+        )
 
     def settled(self) -> tuple[Array, Array, Array, Array]:
         """What to add to the turns of the odometry (M,) rad, the variances (M,) of the sums, and
