@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate
-from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.light import Conditions
 from sfa_localization.keyframes.location import hypotheses, located
 from sfa_localization.keyframes.upright import upright
@@ -22,7 +20,7 @@ from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.sfa.network import Architecture, Layer
 from sfa_localization.sfa.network_training import ImageSequence, train_network
 from sfa_localization.sfa.settings import NetworkConfig
-from sfa_localization.training import Recipe, Trained, learn_place
+from sfa_localization.training import Recipe, learn_place
 
 SIZE = (12, 48)
 LAYERS = (
@@ -44,25 +42,25 @@ class Spheres:
 
     @classmethod
     @cache
-    def about(cls, seed: int, count: int = 40) -> Spheres:
+    def about(cls, seed, count=40):
         rng = np.random.default_rng(seed)
         bearing, reach = rng.uniform(-np.pi, np.pi, count), rng.uniform(3.0, 10.0, count)
         places = reach[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
         heights, radii = rng.uniform(-2.0, 3.0, count), rng.uniform(0.4, 1.6, count)
         return cls(places, heights, radii, rng.uniform(-90, 90, (count, 3)))
 
-    def symmetric(self) -> Spheres:
+    def symmetric(self):
         """The same world four times over, a quarter turn apart."""
         x, y = self.places.T
         places = [np.column_stack(turned) for turned in ((x, y), (-y, x), (-x, -y), (y, -x))]
         again = (np.concatenate([part] * 4) for part in (self.heights, self.radii, self.colors))
         return Spheres(np.concatenate(places), *again)
 
-    def panoramas(self, poses: np.ndarray, config: PanoramaConfig) -> np.ndarray:
+    def panoramas(self, poses, config):
         """Panoramas (T, H, W, 3) uint8 from poses (T, 3)."""
         return np.stack([self._panorama(pose, config) for pose in poses])
 
-    def _panorama(self, pose: np.ndarray, config: PanoramaConfig) -> np.ndarray:
+    def _panorama(self, pose, config):
         h, w = config.height, config.width
         azimuth = (np.arange(w) + 0.5 - w / 2) * 2 * np.pi / w * (-1 if config.clockwise else 1)
         x, y = (self.places - pose[:2]).T
@@ -75,11 +73,18 @@ class Spheres:
         return np.clip(128 + blobs, 0, 255).round().astype(np.uint8)
 
 
-def panorama_config(size: tuple[int, int] = SIZE, clockwise: bool = True) -> PanoramaConfig:
+def panorama_config(size=SIZE, clockwise=True):
     return replace(PanoramaConfig(), height=size[0], width=size[1], clockwise=clockwise)
 
 
-def wander(count: int, seed: int, hz: float = 10.0) -> Odometry:
+def lanes(step=0.25):
+    """Poses (N, 3) of a square of 4 m, each lane headed another way."""
+    along = np.arange(-2.0, 2.01, step)
+    rows = enumerate(along.tolist())
+    return np.array([(x * (-1) ** n, y, np.pi * (n % 2)) for n, y in rows for x in along])
+
+
+def wander(count, seed, hz=10.0):
     """A wandering drive of exact odometry that stays near the origin."""
     rng = np.random.default_rng(seed)
     stamps = 10**9 + np.arange(count) * int(1e9 / hz)
@@ -97,13 +102,13 @@ def wander(count: int, seed: int, hz: float = 10.0) -> Odometry:
     return Odometry(stamps, np.array(poses), held_since, np.tile([1e-4, 1e-4], (count, 1)))
 
 
-def run_in(world: Spheres, odometry: Odometry, config: PanoramaConfig, name: str = 'run') -> Run:
+def run_in(world, odometry, config, name='run'):
     """A run whose pictures show the world from the odometry's poses."""
     images = world.panoramas(odometry.poses, config)
     return Run(name, PanoramaArray(odometry.stamps_ns, images), odometry)
 
 
-def alone(keyframes: Keyframes, image: np.ndarray, conditions: Conditions | None = None):
+def alone(keyframes, image, conditions=None):
     """The `Location` of an image (H, W, 3) by keyframes, without slow features."""
     conditions = conditions or Conditions()
     fits, tilt = hypotheses(keyframes, upright(keyframes, image), conditions.pattern)
@@ -120,7 +125,7 @@ LARGE_LAYERS = (
 PLACE_ARCHITECTURE = Architecture(PLACE_SIZE, PLACE_SIZE, 'none', LARGE_LAYERS)
 
 
-def recipe(clockwise: bool = True) -> Recipe:
+def recipe(clockwise=True):
     """A small network for pictures of PLACE_SIZE."""
     return Recipe(
         panorama=panorama_config(PLACE_SIZE, clockwise),
@@ -131,7 +136,7 @@ def recipe(clockwise: bool = True) -> Recipe:
 
 
 @cache
-def place(clockwise: bool = True) -> Trained:
+def place(clockwise=True):
     """A place learnt from a wandering drive of 400 pictures."""
     config = recipe(clockwise)
     run = run_in(Spheres.about(1), wander(400, 2, hz=4.0), config.panorama)
@@ -140,7 +145,7 @@ def place(clockwise: bool = True) -> Trained:
 
 
 @cache
-def visit(clockwise: bool = True) -> Run:
+def visit(clockwise=True):
     """Another drive in the place, with truth for odometry."""
     true = wander(400, 2, hz=4.0)
     rows = [getattr(true, name)[20::9] for name in ('stamps_ns', 'poses', 'twists', 'variances')]
@@ -148,7 +153,7 @@ def visit(clockwise: bool = True) -> Run:
     return run_in(Spheres.about(1), Odometry(*rows), recipe(clockwise).panorama, 'visit')
 
 
-def drive(count: int = 12, seed: int = 0, size: tuple[int, int] = SIZE) -> ImageSequence:
+def drive(count=12, seed=0, size=SIZE):
     """Panoramas of a short drive, all neighbors."""
     run = run_in(Spheres.about(seed), wander(count, seed), panorama_config(size))
     return ImageSequence(run.panoramas, np.ones(count - 1, bool))
@@ -166,7 +171,7 @@ SMALL_RECIPE = replace(
 """Learns the drive of `write_bag` in seconds."""
 
 
-def write_bag(path: Path, seed: int = 2, size: tuple[int, int] = PLACE_SIZE) -> Path:
+def write_bag(path, seed=2, size=PLACE_SIZE):
     """Record a wandering drive of PICTURES pictures."""
     run = run_in(Spheres.about(1), wander(PICTURES, seed, hz=4.0), panorama_config(size))
     odometry, images = run.odometry, run.panoramas.read(0, PICTURES)

@@ -140,6 +140,10 @@ class FilterDrive:
         value = self.seen[index] if heading else self.seen[index, :2]
         return fused.add_measurement(stamp_ns, value, self.covariance(heading))
 
+    def give_turned(self, fused, stamp_ns, picture):
+        """Tell how far images have turned by a picture, as stamped."""
+        fused.add_turned(stamp_ns, float(self.poses[self.pictures[picture], 2]))
+
     def variances(self):
         return max(self.v_std, 1e-6) ** 2, max(self.omega_std, 1e-6) ** 2
 

@@ -7,10 +7,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from places import distances
 
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, Trajectory, YawRate, integrate
 from sfa_localization.keyframes.offsets import Offsets
+from sfa_localization.metric.segments import cut
+from sfa_localization.motion.settings import SegmentConfig
 
 RATE = 50
 STEP_NS = 1_000_000_000 // RATE
@@ -25,8 +28,12 @@ class DriveWithTruth:
     poses: np.ndarray
     gyro: YawRate
 
+    def segments(self, config=None, gyro=None):
+        """The segments of the odometry."""
+        return cut(self.odometry, self.stamps_ns, config or SegmentConfig(), gyro)
 
-def drive(twists, *, start=(0.0, 0.0, 0.0), bias=0.0, yaw_noise=0.0, speed_noise=0.0, seed=0):
+
+def drive(twists, start=(0.0, 0.0, 0.0), *, bias=0.0, yaw_noise=0.0, speed_noise=0.0, seed=0):
     """Drive twists (T, 2) at 50 Hz; odometry adds a yaw-rate bias and white noise. 5 pictures/s."""
     rng = np.random.default_rng(seed)
     twists = np.asarray(twists, float)
@@ -115,9 +122,10 @@ def exact_features(places):
     )
 
 
-def garden_features(places, *, noise=0.0, count=12, seed=0, world=0):
-    """Smooth random functions of the place, the slowest first, with noise: (N, count)."""
-    rng = np.random.default_rng(world)
+def garden_features(poses, *, noise=0.0, count=12, seed=0, world=0):
+    """Smooth random functions of the place of poses (N, 3), the slowest first, with noise: (N,
+    count)."""
+    rng, places = np.random.default_rng(world), poses[:, :2]
     waves = rng.standard_normal((count, 3, 2)) * np.linspace(0.08, 0.35, count)[:, None, None]
     phases = rng.uniform(0, 2 * np.pi, (count, 3))
     values = np.cos(np.einsum('nd,kwd->nkw', places, waves) + phases).sum(2)
@@ -136,7 +144,7 @@ def mixtures(stack, poses, noise_m=0.0, count=400, seed=0, lasting=False):
         errors[row] = part * errors[row - 1] + np.sqrt(1 - part**2) * errors[row]
     places = poses[stack.images]
     for row in rng.permutation(len(places))[:count]:
-        distance = np.hypot(*(places - places[row])[:, :2].T)
+        distance = distances(places, places[row])
         near = np.flatnonzero((distance < 1.5) & (np.abs(stack.owner - stack.owner[row]) > 1))
         if len(near) >= 12:
             near = rng.permutation(near)[:6]

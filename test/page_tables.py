@@ -5,7 +5,8 @@
 import re
 from pathlib import Path
 
-PAGE = Path(__file__).with_name('README.md')
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / 'test/README.md'
 
 
 def markdown(header, rows):

@@ -17,6 +17,7 @@ from sfa_localization.keyframes.location import Location
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE, Observation
 from sfa_localization.keyframes.regression import Fit
 from sfa_localization.mapping.driven_ground import DrivenGround
+from sfa_localization.place_model import PlaceModel
 
 SIZE = PanoramaConfig(width=64, height=16)
 STEP_M = 0.05
@@ -84,6 +85,11 @@ class PictureReader:
         pose = np.append(position, yaw if self.heading else 0.0)
         spread[2, 2] = spread[2, 2] if self.heading else UNKNOWN_YAW_VARIANCE
         return Observation(pose, spread, pose, explained)
+
+
+def load_pictures(monkeypatch):
+    """Let any model that is loaded read pictures."""
+    monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
 
 
 class Recording:

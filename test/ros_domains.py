@@ -11,7 +11,7 @@ _DOMAINS = range(1, 101)  # above, ports may be those of the system
 _held = []
 
 
-def free_domain() -> int:
+def free_domain():
     """A domain of this process alone, until it ends."""
     for domain in _DOMAINS:
         path = Path(tempfile.gettempdir()) / f'sfa_localization_domain_{domain}.lock'

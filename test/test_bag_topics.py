@@ -10,6 +10,7 @@ import bag_formats as formats
 import numpy as np
 import pytest
 from bag_formats import PERIOD, pose, read_odometry, stamp
+from numpy.testing import assert_allclose
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -89,16 +90,16 @@ def test_poses_come_in_any_type_and_serve_as_odometry_when_named(make_message, t
     with Bag(path, strict=True) as bag:
         truth, read = bag.trajectory(name), read_odometry(bag, name)
     assert truth.stamps_ns.tolist() == [stamp(i) for i in range(COUNT)]
-    np.testing.assert_allclose(truth.poses, EXPECTED, atol=1e-12)
-    np.testing.assert_allclose(read.poses, EXPECTED, atol=1e-12)
+    assert_allclose(truth.poses, EXPECTED, atol=1e-12)
+    assert_allclose(read.poses, EXPECTED, atol=1e-12)
     if make_message is not odometry:
         speed = math.hypot(0.5, 0.25) * 1e9 / PERIOD
-        np.testing.assert_allclose(read.twists[:, 0], speed, rtol=1e-4)
-        np.testing.assert_allclose(read.twists[:, 1], 0.02 * 1e9 / PERIOD, atol=1e-6)
+        assert_allclose(read.twists[:, 0], speed, rtol=1e-4)
+        assert_allclose(read.twists[:, 1], 0.02 * 1e9 / PERIOD, atol=1e-6)
         assert not read.variances.any()
     entries = [('/p', stamp(i), pose_stamped(stamp(i), -0.1 * i, 0.0, 0.0)) for i in range(4)]
     with Bag(record(tmp_path / 'backwards', entries)) as bag:
-        np.testing.assert_allclose(read_odometry(bag, '/p').twists, [[-1.0, 0.0]] * 4, atol=1e-9)
+        assert_allclose(read_odometry(bag, '/p').twists, [[-1.0, 0.0]] * 4, atol=1e-9)
 
 
 def test_a_transform_is_selected_by_its_frame(tmp_path):
@@ -112,7 +113,7 @@ def test_a_transform_is_selected_by_its_frame(tmp_path):
             bag.trajectory('/tf')
         truth = bag.trajectory('/tf:base_link')
         assert bag.counts['/tf'].skipped == {'transforms of other frames': 1}
-    np.testing.assert_allclose(truth.poses, EXPECTED, atol=1e-12)
+    assert_allclose(truth.poses, EXPECTED, atol=1e-12)
 
 
 def fix(stamp_ns, latitude, longitude, std=0.0, status=2):
@@ -265,7 +266,7 @@ def test_stamps_that_cannot_be(tmp_path):
     with Bag(path) as bag, refusal:
         bag.trajectory()
     with Bag(path, config=BagConfig(stamp_source='receive')) as bag:
-        np.testing.assert_allclose(bag.trajectory().poses, EXPECTED, atol=1e-12)
+        assert_allclose(bag.trajectory().poses, EXPECTED, atol=1e-12)
 
 
 def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(tmp_path, caplog):
@@ -279,7 +280,7 @@ def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(tmp_path, capl
     run = read_drive(tmp_path / 'bag', tmp_path / 'cache')
     assert run.yaw_rate is None and len(run.panoramas) == 4
     assert 'no message on /imu: continuing without gyroscope' in caplog.text
-    assert not any('imu' in lack for lack in inspect(tmp_path / 'bag').lacks)
+    assert 'imu' not in ' '.join(inspect(tmp_path / 'bag').lacks)
     with pytest.raises(BagError, match='/imu'):
         read_drive(tmp_path / 'bag', tmp_path, ReadingRecipe(topics=TopicNames(imu='/imu')))
 

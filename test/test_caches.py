@@ -7,14 +7,13 @@ import signal
 import subprocess
 import sys
 from functools import partial
-from pathlib import Path
 
 import pytest
+from page_tables import ROOT
 
 from sfa_localization import cli
 from sfa_localization.data.rejections import LONGEST, MOST, OTHER, RejectionCounter, short_line
 
-ROOT = Path(__file__).parents[1]
 TRAIN_AND_WAIT = """
 import sys, time
 from pathlib import Path
@@ -46,7 +45,7 @@ def test_a_signal_leaves_no_images(number, tmp_path):
 
 
 def test_a_full_machine_is_a_single_line(capsys):
-    def fail(error) -> int:
+    def fail(error):
         raise error
 
     full, unmapped = OSError(28, 'No space left on device'), 'a.so: failed to map segment from'

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from real_cameras import DESK_CENTER, DESK_RADII, desk_mirror, ordinary
 from test_calibration_files import kalibr
 
@@ -37,10 +38,8 @@ def scene(seed, background=10.0, center=CENTER, radii=RADII, size=(480, 640)):
 
 def assert_circles(circles, center=CENTER, radii=RADII, atol=1.0, hole_atol=2.0):
     rim, hole = circles.rim, circles.hole
-    np.testing.assert_allclose((rim.column, rim.row, rim.radius), (*center, radii[1]), atol=atol)
-    np.testing.assert_allclose(
-        (hole.column, hole.row, hole.radius), (*center, radii[0]), atol=hole_atol
-    )
+    assert_allclose((rim.column, rim.row, rim.radius), (*center, radii[1]), atol=atol)
+    assert_allclose((hole.column, hole.row, hole.radius), (*center, radii[0]), atol=hole_atol)
 
 
 def test_a_mirror_on_a_dark_and_on_a_bright_still_background():
@@ -55,7 +54,7 @@ def test_a_mirror_on_a_dark_and_on_a_bright_still_background():
 
 def test_a_rim_that_the_image_cuts_off_and_a_mirror_without_a_hole():
     rim = find_circles([scene(1, center=(330.0, 200.0), radii=(42.0, 260.0))]).rim
-    np.testing.assert_allclose((rim.column, rim.row, rim.radius), (330, 200, 260), atol=2.0)
+    assert_allclose((rim.column, rim.row, rim.radius), (330, 200, 260), atol=2.0)
     assert find_circles([scene(1, radii=(0.0, 200.0))]).hole is None
 
 
@@ -78,7 +77,7 @@ def test_a_soft_rim_is_detected_at_any_resolution(soft):
         image = cv2.resize(np.clip(picture, 0, 255).astype(np.uint8), (side, side))
         rim, scale = find_circles([image]).rim, side / 480
         circle = np.array([rim.column, rim.row, rim.radius]) / scale
-        np.testing.assert_allclose(circle, (*center, radius), atol=0.015 * radius)
+        assert_allclose(circle, (*center, radius), atol=0.015 * radius)
 
 
 @pytest.mark.parametrize(('count', 'turns'), [(1, 'mirror'), (8, 'mirror'), (8, 'picture')])

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from numpy.testing import assert_allclose
 
 from sfa_localization.camera.calibration_files import (
     calibration_of,
@@ -151,7 +152,7 @@ def test_ocam(tmp_path):
     )  # fmt: skip
     ray = make_camera(lens, (480, 640)).unproject(np.array([[318.5 - 0.2, 241.5 + 99.9]]))
     expected = np.array([[-100.0, 0.0, 187.0]]) / np.hypot(100, 187)
-    np.testing.assert_allclose(ray, expected, atol=1e-12)
+    assert_allclose(ray, expected, atol=1e-12)
     path = str(tmp_path / 'calib_results.txt')
     assert calibration_of(CameraConfig(calibration_file=path, camera_model='panorama')) == lens
 

@@ -13,12 +13,12 @@ from sfa_localization.camera.turns import headings
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import PanoramaArray, Run, integrate
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
+from sfa_localization.fusion.camera_clock import camera_clock
 
 SIZE = (20, 120)
 
 
-def clock_of(run: Run) -> CameraClock:
+def clock_of(run):
     return camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
 
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from places import distances
 
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
@@ -63,17 +65,17 @@ def test_rays_and_pixels_are_each_others_inverse_where_the_camera_sees(name):
     pixels = camera.project(rays())
     seen = np.isfinite(pixels).all(axis=1)
     assert seen.sum() > 100
-    np.testing.assert_allclose(camera.unproject(pixels[seen]), rays()[seen], atol=1e-9)
+    assert_allclose(camera.unproject(pixels[seen]), rays()[seen], atol=1e-9)
     assert np.all((pixels[seen] >= -0.5) & (pixels[seen] <= 639.5))
     if camera.lens.center is not None:
-        radius = np.hypot(*(pixels[seen] - [config.cx, config.cy]).T)
+        radius = distances(pixels[seen], [config.cx, config.cy])
         assert config.radius_min <= radius.min()
         assert radius.max() <= (config.radius_max or np.inf)
     back = camera.unproject(grid)
     seen = np.isfinite(back).all(axis=1)
     assert seen.sum() > 1000
-    np.testing.assert_allclose(np.linalg.norm(back[seen], axis=1), 1.0, atol=1e-12)
-    np.testing.assert_allclose(camera.project(back[seen]), grid[seen], atol=1e-6)
+    assert_allclose(np.linalg.norm(back[seen], axis=1), 1.0, atol=1e-12)
+    assert_allclose(camera.project(back[seen]), grid[seen], atol=1e-6)
 
 
 def test_the_mirror_model_by_hand():
@@ -84,11 +86,11 @@ def test_the_mirror_model_by_hand():
     expected = [[319.5, 319.5 - 150 / 0.9], [319.5 + 150 / 0.9, 319.5], [319.5, 319.5],
                 [319.5, 319.5 - radius]]  # fmt: skip
     seen = camera.project(np.array([FORWARD, LEFTWARD, -UP, slanted]))
-    np.testing.assert_allclose(seen, expected)
+    assert_allclose(seen, expected)
     assert np.isnan(camera.project(np.array([UP, [np.nan, 0, 0], [0, 0, 0]]))).all()
     angle = np.array([0.2, 0.9, 1.5, 2.0])  # a paraboloid maps it to the radius tan(angle / 2)
     pixels = lens_of(xi=1.0, fx=100.0, fy=100.0).project(unit(*angle))
-    np.testing.assert_allclose(pixels[:, 0], 100 * np.tan(angle / 2))
+    assert_allclose(pixels[:, 0], 100 * np.tan(angle / 2))
 
 
 def test_pinhole_and_fisheye_agree_with_opencv():
@@ -99,21 +101,21 @@ def test_pinhole_and_fisheye_agree_with_opencv():
     matrix = np.array([[400.0, 0, 300.0], [0, 410.0, 330.0], [0, 0, 1]])
     theirs = cv2.projectPoints(optical, none, none, matrix, np.array(coefficients))[0]
     ours = make_camera(LensCalibration(**lens, **PINHOLE), SIZE)
-    np.testing.assert_allclose(ours.project(forward), theirs.reshape(-1, 2), atol=1e-6)
+    assert_allclose(ours.project(forward), theirs.reshape(-1, 2), atol=1e-6)
     config = CAMERAS['kannala-brandt']
     ours = make_camera(config, SIZE)
     above = rays()[(rays()[:, 2] > 0.2) & np.isfinite(ours.project(rays())[:, 0])]
     optical = np.column_stack([above[:, 1], -above[:, 0], above[:, 2]])[:, None]
     matrix = np.array([[190.0, 0, 319.5], [0, 191.0, 319.5], [0, 0, 1]])
     theirs, _ = cv2.fisheye.projectPoints(optical, none, none, matrix, np.array(config.distortion))
-    np.testing.assert_allclose(ours.project(above), theirs.reshape(-1, 2), atol=1e-6)
+    assert_allclose(ours.project(above), theirs.reshape(-1, 2), atol=1e-6)
 
 
 def test_a_polar_picture_by_hand():
     """For ocam see test_calibration_files.py."""
     pixels = np.array([[319.5, 319.5 - 60.0], [319.5, 319.5 - 300.0]])
     forward = make_camera(CAMERAS['polar'], SIZE).unproject(pixels)
-    np.testing.assert_allclose(np.degrees(np.arcsin(forward[:, 2])), [78 - 90, 114 - 90])
+    assert_allclose(np.degrees(np.arcsin(forward[:, 2])), [78 - 90, 114 - 90])
 
 
 def test_where_the_picture_looks():
@@ -125,7 +127,7 @@ def test_where_the_picture_looks():
     ):  # fmt: skip
         settings = {'axis': axis, 'mirrored': mirrored, 'fx': 100.0, 'fy': 100.0}
         camera = make_camera(LensCalibration(camera_model='fisheye', **settings, **OPEN), SIZE)
-        np.testing.assert_allclose(camera.unproject(pixels), looks, atol=1e-12)
+        assert_allclose(camera.unproject(pixels), looks, atol=1e-12)
 
 
 def test_roll_comes_first_then_pitch_then_yaw():
@@ -137,7 +139,7 @@ def test_roll_comes_first_then_pitch_then_yaw():
         ((90.0, 0.0, 0.0), right, -UP), ((90.0, 90.0, 90.0), right, -LEFTWARD),
     ):  # fmt: skip
         camera = make_camera(lens, (200, 400), mount_rpy=mount)
-        np.testing.assert_allclose(camera.unproject(np.array([pixel])), [ray], atol=1e-12)
+        assert_allclose(camera.unproject(np.array([pixel])), [ray], atol=1e-12)
     with pytest.raises(ConfigError, match='roll, pitch and yaw'):
         CameraConfig(mount_rpy=(1.0, 2.0))
 
@@ -146,7 +148,7 @@ def test_intrinsics_follow_the_size_of_the_picture():
     large, small = (make_camera(LensCalibration(), size).project(rays())
                     for size in (SIZE, (320, 320)))  # fmt: skip
     both = np.isfinite(large[:, 0]) & np.isfinite(small[:, 0])
-    np.testing.assert_allclose((small[both] + 0.5) * 2 - 0.5, large[both], atol=1e-9)
+    assert_allclose((small[both] + 0.5) * 2 - 0.5, large[both], atol=1e-9)
 
 
 def test_distortion_beyond_its_increasing_part_is_not_used():
@@ -176,4 +178,4 @@ def test_the_panorama_model_uses_the_elevations_of_the_panorama():
     panorama = PanoramaConfig(elevation_min=-10.0, elevation_max=30.0)
     camera = make_camera(LensCalibration(camera_model='panorama'), (40, 360), panorama)
     looks = camera.unproject(np.array([[179.5, -0.5], [179.5, 39.5]]))
-    np.testing.assert_allclose(np.degrees(np.arcsin(looks[:, 2])), [30.0, -10.0])
+    assert_allclose(np.degrees(np.arcsin(looks[:, 2])), [30.0, -10.0])

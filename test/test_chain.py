@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from picture_readers import SIZE, PictureReader, Recording, panorama
+from picture_readers import SIZE, PictureReader, Recording, load_pictures, panorama
 
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.data.events import ODOMETRY
@@ -14,7 +14,6 @@ from sfa_localization.data.run import Trajectory
 from sfa_localization.evaluation import evaluate, fit_transform, moved
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.localizer import Localizer
-from sfa_localization.place_model import PlaceModel
 
 pytest.importorskip('rclpy')
 
@@ -39,7 +38,7 @@ START_NS = 1_700_000_000_000_000_000
 @pytest.fixture(autouse=True)
 def reader(monkeypatch):
     """Every model reads the pose off the picture."""
-    monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
+    load_pictures(monkeypatch)
 
 
 def pose_of(message):

@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loop closures, right in any light; how they and links of odometry bend graph and map."""
 
-import dataclasses
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres
 from metric_worlds import criss_cross, drive, garden_features, meander, mixtures, straight, turn
+from numpy.testing import assert_allclose
+from places import aligned_errors, as_complex, distances, lengths
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import align, compose, wrap_angle
@@ -24,17 +26,16 @@ from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.loops import with_closures
 from sfa_localization.metric.pose_graph import Graph, cost, form_of, graph_poses, proof, refined
-from sfa_localization.metric.segments import cut, join
+from sfa_localization.metric.segments import join
 from sfa_localization.metric.stack import SegmentPoses, Stack, tracks
-from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.sfa.zero_time_edges import edges_between
 
 CONFIG = PanoramaConfig(width=120, height=24)
-COUNTER = dataclasses.replace(CONFIG, clockwise=False)
+COUNTER = replace(CONFIG, clockwise=False)
 GP = MetricConfig(slow_features=12)
 
 
-def wander(count: int, seed: int) -> np.ndarray:
+def wander(count, seed):
     """Poses (N, 3) of a winding drive, 0.1 m apart, turned anyhow."""
     rng = np.random.default_rng(seed)
     t = np.cumsum(np.full(count, 0.06)) + seed
@@ -42,13 +43,13 @@ def wander(count: int, seed: int) -> np.ndarray:
     return np.column_stack([places, np.cumsum(rng.normal(0, 0.3, count))])
 
 
-def views(worlds: list[Spheres], drives: list[np.ndarray], config=CONFIG, gamma=1.0) -> Textures:
+def views(worlds, drives, config=CONFIG, gamma=1.0):
     """Of drives, each in its world; all but the first in another light."""
     textures, run = [], np.repeat(np.arange(len(drives)), list(map(len, drives)))
     for number, (world, poses) in enumerate(zip(worlds, drives, strict=True)):
         images = 255 * (world.panoramas(poses, config) / 255) ** (gamma if number else 1.0)
         textures += [texture(image) for image in images.astype(np.uint8)]
-    steps = np.hypot(*np.diff(np.concatenate(drives)[:, :2], axis=0, prepend=drives[0][:1, :2]).T)
+    steps = lengths(np.diff(np.concatenate(drives), axis=0, prepend=drives[0][:1]))
     path_m = np.cumsum(np.where(np.diff(run, prepend=0), 0.0, steps))
     return Textures(quantized(np.stack(textures)), np.arange(len(run)), run, path_m)
 
@@ -63,7 +64,7 @@ def test_closures_are_of_the_same_place_and_measure_the_turn(config):
     first, second = closures.images.T
     between, third = seen.run[first] != seen.run[second], second >= 450
     assert not (between & third).any() and between.sum() > 20
-    assert (np.hypot(*(true[first] - true[second])[:, :2].T) < 0.5).mean() > 0.93
+    assert (distances(true[first], true[second]) < 0.5).mean() > 0.93
     error = np.abs(wrap_angle(true[second, 2] - true[first, 2] - closures.turn))
     assert np.median(error) < np.radians(1.5)
     way = np.abs(seen.path_m[first] - seen.path_m[second])
@@ -77,15 +78,15 @@ def test_closures_are_of_the_same_place_and_measure_the_turn(config):
 def in_two_lights():
     """Two drives whose features have nothing in common, as in lights that no feature survives."""
     drives = [
-        drive(twists, start=start, bias=1e-3, yaw_noise=0.01, speed_noise=0.03, seed=seed)
+        drive(twists, start, bias=1e-3, yaw_noise=0.01, speed_noise=0.03, seed=seed)
         for seed, (twists, start) in enumerate([criss_cross(12, seed=1), meander(120.0)])
     ]
-    parts = [cut(run.odometry, run.stamps_ns, SegmentConfig()) for run in drives]
+    parts = [run.segments() for run in drives]
     first = len(drives[0].poses)
     poses = np.vstack([run.poses for run in drives])
     features = np.zeros((len(poses), 12))
-    features[:, :6] = garden_features(poses[:, :2], noise=0.05, count=6)
-    features[first:] = 5.0 + garden_features(poses[first:, :2], noise=0.05, world=3)
+    features[:, :6] = garden_features(poses, noise=0.05, count=6)
+    features[first:] = 5.0 + garden_features(poses[first:], noise=0.05, world=3)
     return poses, features, join(parts, [0, first])
 
 
@@ -101,7 +102,7 @@ def true_closures(poses, first):
 def errors_of(images, estimated, poses):
     """Errors (N,) m and (N,) rad of estimated poses (N, 3) of images."""
     frame = align(estimated[:, :2], poses[images, :2])
-    far = np.hypot(*(frame.apply(estimated[:, :2]) - poses[images, :2]).T)
+    far = distances(frame.apply(estimated[:, :2]), poses[images])
     return far, np.abs(wrap_angle(estimated[:, 2] + frame.yaw_rad - poses[images, 2]))
 
 
@@ -119,8 +120,8 @@ def test_offsets_tie_drives_whose_features_have_nothing_in_common_and_do_not_ben
     lies = rng.random(len(offsets.images)) < 0.15
     turn = np.where(lies[:, None], rng.uniform(-np.pi, np.pi, offsets.turn.shape), offsets.turn)
     images = np.where(lies, rng.permutation(offsets.images), offsets.images)
-    offsets = dataclasses.replace(offsets, images=images, turn=turn)
-    measured = dataclasses.replace(segments, offsets=offsets)
+    offsets = replace(offsets, images=images, turn=turn)
+    measured = replace(segments, offsets=offsets)
     results = [learn_metric(each, measured, GP) for each in (features, features[:, ::-1])]
     (far, turned), (other, _) = (errors_of(each.images, each.poses, poses) for each in results)
     assert results[0].graph.certificate.certified and np.allclose(far, other)
@@ -133,30 +134,30 @@ def test_offsets_hold_in_any_frame():
     offsets = find_offsets(seen, poses, CONFIG.sphere)
     assert len(offsets.images) > 20
     mixed = (offsets.shares[:, :, None] * poses[offsets.others, :2]).sum(1)
-    assert np.median(np.hypot(*(mixed - poses[offsets.images, :2]).T)) < 0.05
+    assert np.median(distances(mixed, poses[offsets.images])) < 0.05
     turn = wrap_angle(poses[offsets.images, None, 2] - poses[offsets.others, 2] - offsets.turn)
     assert np.median(np.abs(turn)) < np.radians(1.0)
     same = find_offsets(seen, compose(np.array([3.0, -1.0, 0.7]), poses), CONFIG.sphere)
     assert np.array_equal(same.images, offsets.images)
     again = (same.shares[:, :, None] * poses[same.others, :2]).sum(1)
-    np.testing.assert_allclose(again, mixed, atol=0.01)
+    assert_allclose(again, mixed, atol=0.01)
 
 
 def measured_world(noise_m=0.02, seed=0):
     """Two drives with offsets, each in an odometry frame of its own."""
     poses, _, segments = in_two_lights()
     offsets = mixtures(Stack.of(segments), poses, noise_m, 1000, seed, lasting=True)
-    return poses, dataclasses.replace(segments, offsets=offsets)
+    return poses, replace(segments, offsets=offsets)
 
 
 def test_angles_that_wind_around_a_ring_are_no_minimum():
     """Equal links of a ring have a local minimum there, which is left."""
     count, ring = 12, np.arange(12)
     _, segments = measured_world()
-    stack = Stack.of(dataclasses.replace(segments, items=segments.items[:count]))
+    stack = Stack.of(replace(segments, items=segments.items[:count]))
     wound = np.exp(2j * np.pi * ring / count)
     starts = np.column_stack([np.zeros((count, 2)), np.angle(wound)])
-    stack = dataclasses.replace(stack, starts=starts, period=np.zeros(count, int))
+    stack = replace(stack, starts=starts, period=np.zeros(count, int))
     edges = stack.sparse(
         (count + ring, np.ones(count)), (count + np.roll(ring, 1), -np.ones(count))
     )
@@ -186,17 +187,16 @@ def test_the_graph_errs_as_it_says():
 
 def test_odometry_that_turns_wrongly_misleads_no_graph():
     """From where it leads, the least squares end in a wrong minimum."""
-    twists, start = meander(150.0)
-    run = drive(twists, start=start, bias=0.06, yaw_noise=0.05)
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    run = drive(*meander(150.0), bias=0.06, yaw_noise=0.05)
+    segments = run.segments()
     offsets = mixtures(Stack.of(segments), run.poses, 0.03, count=1000)
-    graph = Graph.of(dataclasses.replace(segments, offsets=offsets))
+    graph = Graph.of(replace(segments, offsets=offsets))
     assert graph.certificate.certified and graph.poses.bias == pytest.approx(0.06, abs=0.01)
 
 
 def test_what_nothing_ties_is_uncertain():
     _, _, segments = in_two_lights()
-    single = Graph.of(dataclasses.replace(segments, items=segments.items[:1]))
+    single = Graph.of(replace(segments, items=segments.items[:1]))
     assert single.certificate.certified and abs(single.poses.z[0]) == pytest.approx(1.0)
     graph, first = Graph.of(segments), [s.run for s in segments].count(0)
     between = np.eye(len(segments))[0] - np.eye(len(segments))[first]
@@ -208,11 +208,11 @@ def test_a_segment_along_an_earlier_track_has_its_number_and_is_held_out_with_it
     """A second drive along the same track, somewhat aside."""
     twists, start = criss_cross(8, seed=1)
     aside = (start[0], start[1] + 0.1, start[2])
-    drives = [drive(twists, start=place, yaw_noise=0.002) for place in (start, aside)]
-    parts = [cut(run.odometry, run.stamps_ns, SegmentConfig()) for run in drives]
+    drives = [drive(twists, place, yaw_noise=0.002) for place in (start, aside)]
+    parts = [run.segments() for run in drives]
     first, half = len(drives[0].poses), len(parts[0])
     closures = true_closures(np.vstack([run.poses for run in drives]), first)
-    segments = dataclasses.replace(join(parts, [0, first]), closures=closures)
+    segments = replace(join(parts, [0, first]), closures=closures)
     track = tracks(segments)
     assert (track[:half] == np.arange(half)).mean() > 0.9
     assert (track[half:] < half).mean() > 0.8
@@ -226,7 +226,7 @@ def test_a_segment_along_an_earlier_track_has_its_number_and_is_held_out_with_it
 
 def test_doors_of_a_corridor_that_look_alike_close_no_loop():
     run = drive(np.vstack([straight(30.0), turn(np.pi), straight(30.0)]), yaw_noise=0.01)
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    segments = run.segments()
     there, back = np.arange(10, 140, 25), len(run.poses) - 1
     true, alike = np.column_stack([there, back - there]), np.column_stack([there[:-1], there[1:]])
     closures = Closures(np.vstack([true, alike]), np.zeros(len(true) + len(alike)))
@@ -246,18 +246,17 @@ def worse(segments, factor, seed=0):
         std = np.sqrt((factor - 1) * item.displacement_variance)
         moved = item.displacement + std * complex(*rng.standard_normal(2))
         turned = item.turn_rad + np.sqrt((factor - 1) * item.turn_variance) * rng.standard_normal()
-        return dataclasses.replace(item, displacement=moved, turn_rad=float(turned))
+        return replace(item, displacement=moved, turn_rad=float(turned))
 
-    return dataclasses.replace(segments, items=tuple(wrong(item) for item in segments))
+    return replace(segments, items=tuple(wrong(item) for item in segments))
 
 
 @cache
 def recorded():
     """A drive, its segments, features of its images, and the fit of them."""
-    twists, start = meander(250.0, seed=2)
-    run = drive(twists, start=start, yaw_noise=0.01, speed_noise=0.03, seed=2)
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
-    features = garden_features(run.poses[:, :2], noise=0.05)
+    run = drive(*meander(250.0, seed=2), yaw_noise=0.01, speed_noise=0.03, seed=2)
+    segments = run.segments()
+    features = garden_features(run.poses, noise=0.05)
     return run, segments, features, solved(segments, features)
 
 
@@ -278,7 +277,7 @@ def map_error(fit):
     """Mean error of a map, m."""
     places = np.column_stack([fit.places.real, fit.places.imag])
     truth = recorded()[0].poses[fit.stack.images, :2]
-    return np.hypot(*(align(places, truth).apply(places) - truth).T).mean()
+    return aligned_errors(places, truth).mean()
 
 
 def test_links_that_err_by_more_than_they_say_weigh_less_for_the_good_of_the_map(
@@ -299,8 +298,8 @@ def test_a_wheel_that_slips_costs_single_links():
     _, segments, features, right = recorded()
     slipped = list(segments)
     for n in (10, 40, 70):
-        slipped[n] = dataclasses.replace(slipped[n], displacement=slipped[n].displacement + 0.7)
-    fit = solved(dataclasses.replace(segments, items=tuple(slipped)), features)
+        slipped[n] = replace(slipped[n], displacement=slipped[n].displacement + 0.7)
+    fit = solved(replace(segments, items=tuple(slipped)), features)
     (_, before), (_, move) = factors(right), factors(fit)
     wrong = np.isin(fit.links.at, (10, 40, 70))
     assert move[wrong].min() > 10.0
@@ -312,7 +311,7 @@ def test_the_gram_is_what_eq_1_costs_at_the_best_map():
     stack, n, ridge = fit.stack, fit.stack.segments, fit.ridge
     bias = 1e-3 * rng.normal(size=stack.period[-1] + 1)
     z = np.exp(1j * rng.uniform(-3, 3, n))
-    poses = SegmentPoses(z, rng.normal(size=(n, 2)) @ [1, 1j], bias)
+    poses = SegmentPoses(z, as_complex(rng.normal(size=(n, 2))), bias)
     places, y = poses.places(stack), poses.coefficients(stack.period)
     weights = ridge.fitted(places)
     residuals = places - ridge.expanded @ weights

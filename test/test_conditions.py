@@ -10,7 +10,6 @@ from test_keyframes import COUNTER, learnt, stds, unseen, within
 from test_location import STD, fit_at, locate
 
 from sfa_localization.keyframes.light import Conditions
-from sfa_localization.keyframes.location import Location
 
 
 def sunny(poses, config, share=0.3):
@@ -54,7 +53,7 @@ def test_what_the_light_adds_everywhere_moves_no_place():
     assert patterns[1] < 0.2 * patterns[0]
 
 
-def seen(x, residual, outward=0.2) -> Location:
+def seen(x, residual, outward=0.2):
     return locate([fit_at(x, residual=residual.astype(np.complex64), outward=outward)])
 
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from filter_drives import lasting
+from numpy.testing import assert_allclose
 
 from sfa_localization.data.error_correlation import LEAST_M, ErrorCorrelation
 from sfa_localization.data.errors import DataError
@@ -51,8 +52,8 @@ def test_errors_that_are_alike_count_as_fewer():
     """By hand: 0.5 of errors fades to a half in 1 m; what is far separate has nothing in common."""
     correlation = ErrorCorrelation(0.5, 1.0 / math.log(2.0))
     alike = correlation.alike(np.array([1.0, 0.0, 100.0, 2.0]))
-    np.testing.assert_allclose(alike, [1.5, 1.375, 1.0, 1.375])
-    np.testing.assert_allclose(correlation.alike(np.zeros(5)), 3.0)
+    assert_allclose(alike, [1.5, 1.375, 1.0, 1.375])
+    assert_allclose(correlation.alike(np.zeros(5)), 3.0)
     assert correlation.alike(np.zeros(0)).shape == (0,)
 
 

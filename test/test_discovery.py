@@ -4,9 +4,7 @@
 
 import numpy as np
 import pytest
-from picture_readers import PictureReader
-
-from sfa_localization.place_model import PlaceModel
+from picture_readers import load_pictures
 
 pytest.importorskip('rclpy')
 
@@ -143,7 +141,7 @@ def test_the_output_of_another_localizer_is_no_sensor(bench, kind, other, topics
 
 def test_without_images_the_diagnostics_name_those_that_there_are(bench, monkeypatch):
     """Of both types: another `image_transport` may be all that is wrong."""
-    monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
+    load_pictures(monkeypatch)
     both = ((Image, '/a'), (Image, '/b'), (CompressedImage, '/c'), (CompressedImage, '/d'))
     for kind, name in both:
         bench.node.create_publisher(kind, name, 10)

@@ -15,12 +15,12 @@ import shlex
 import subprocess
 import sys
 import types
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from picture_readers import PictureReader
+from page_tables import ROOT
+from picture_readers import load_pictures
 from robustness import promises
 from study import page as results_page
 from study.__main__ import study_parser
@@ -30,9 +30,7 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.data.settings import Settings
 from sfa_localization.nodes.process import CANNOT_START, DIED
 from sfa_localization.nodes.settings import EkfNodeConfig
-from sfa_localization.place_model import PlaceModel
 
-ROOT = Path(__file__).parents[1]
 PAGES = {
     path.relative_to(ROOT).as_posix(): path.read_text('utf-8')
     for pattern in ('*.md', 'config/*.md', 'bags/*.md', 'test/*.md')
@@ -78,7 +76,7 @@ def test_every_command_exists():
     assert count > 50 and wrong == {}
 
 
-def check(program: str, *words: str) -> None:
+def check(program, *words):
     if program == 'ros2':
         check_ros2(*words)
     elif program == 'make':
@@ -96,7 +94,7 @@ def check(program: str, *words: str) -> None:
         assert program in FOREIGN, f'unknown program {program}'
 
 
-def check_ros2(*words: str) -> None:
+def check_ros2(*words):
     if ' '.join(words[:2]) in FOREIGN_ROS:
         return
     if words[:2] == ('bag', 'play'):
@@ -112,7 +110,7 @@ def check_ros2(*words: str) -> None:
     assert {word.partition(':=')[0] for word in rest} <= arguments | {'--show-args'}
 
 
-def check_command(name: str, *words: str) -> None:
+def check_command(name, *words):
     if name in NODES:  # with parameters that are settings, and remapped topics of its own
         assert words[:1] in ((), ('--ros-args',), ('...',))
         for option, value in zip(words[1::2], words[2::2], strict=True):
@@ -123,13 +121,13 @@ def check_command(name: str, *words: str) -> None:
         cli.command_parser(name).parse_args(words)
 
 
-def parameters() -> set[str]:
+def parameters():
     """Return the names of all settings, which the nodes' parameters are."""
     groups = Settings.__subclasses__()
     return {item.name for group in groups for item in dataclasses.fields(group)} | {'use_sim_time'}
 
 
-def topics() -> set[str]:
+def topics():
     """Return the topics in the table of config/README.md, which those of the nodes are."""
     return {topic for topic, *_ in TOPIC_ROW.findall(PAGES['config/README.md'])}
 
@@ -172,7 +170,7 @@ def test_the_table_of_topics_is_that_of_the_nodes(bench, monkeypatch):
 
     from sfa_localization.nodes import ekf_node, omnicam_node, sfa_node
 
-    monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
+    load_pictures(monkeypatch)
     nodes = [
         bench.run(omnicam_node.OmnicamNode, level_by_imu=True),
         bench.run(sfa_node.SfaNode, model='model.npz'),

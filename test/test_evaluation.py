@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from picture_readers import PictureReader, Recording
+from picture_readers import PictureReader, Recording, load_pictures
 from scipy import signal
 
 from sfa_localization import evaluation
@@ -24,7 +24,6 @@ from sfa_localization.fusion.belief import DrivenPath
 from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.fusion.health import health_of
 from sfa_localization.motion.truth import TruePoses
-from sfa_localization.place_model import PlaceModel
 
 
 @pytest.fixture(scope='module')
@@ -34,7 +33,7 @@ def bag(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def model(monkeypatch):
-    monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
+    load_pictures(monkeypatch)
 
 
 def read_truth(bag):

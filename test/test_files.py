@@ -14,6 +14,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from page_tables import ROOT
 from test_calibration import INFO
 
 from sfa_localization.bags import writer as bag_writer
@@ -23,7 +24,7 @@ from sfa_localization.commands import demo
 from sfa_localization.data.errors import BagError, DataError, LocalizationError
 from sfa_localization.data.files import atomic_write
 
-BAGS = Path(__file__).parents[1] / 'bags'
+BAGS = ROOT / 'bags'
 FULL = OSError(errno.ENOSPC, 'No space left on device')
 
 

@@ -8,6 +8,7 @@ import os
 import numpy as np
 import pytest
 from filter_drives import START_NS, FilterDrive
+from places import distances
 
 from sfa_localization.cli import main
 from sfa_localization.data.error_correlation import ErrorCorrelation
@@ -48,12 +49,12 @@ def read_tum(path):
 def errors(drive, stamps, poses, shift_ns=0):
     at = np.searchsorted(drive.stamps_ns, stamps - shift_ns)
     assert np.array_equal(drive.stamps_ns[at], stamps - shift_ns)
-    return np.hypot(*(poses[:, :2] - drive.poses[at, :2]).T)
+    return distances(poses, drive.poses[at])
 
 
 def alone(drive):
     """The mean error of the positions."""
-    return np.hypot(*(drive.seen[:, :2] - drive.poses[drive.pictures, :2]).T).mean()
+    return distances(drive.seen, drive.poses[drive.pictures]).mean()
 
 
 def test_the_command_writes_what_the_live_filter_would_have_said(tmp_path):

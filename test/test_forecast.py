@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from metric_worlds import criss_cross, drive, garden_features, grid, lanes, meander
+from places import distances, lengths
 from scipy.ndimage import gaussian_filter1d
 
 from sfa_localization.data.errors import DataError
@@ -17,9 +18,7 @@ from sfa_localization.mapping.forecast import REACH_M
 from sfa_localization.mapping.learning import learn_metric
 from sfa_localization.mapping.selection import folds
 from sfa_localization.mapping.settings import MetricConfig
-from sfa_localization.metric.segments import cut
 from sfa_localization.metric.stack import Stack
-from sfa_localization.motion.settings import SegmentConfig
 
 CONFIG = MetricConfig(slow_features=12)
 DRIVES = {
@@ -32,10 +31,9 @@ DRIVES = {
 @cache
 def trained(name):
     """True poses at the images, segments, features and the map of a noisy drive."""
-    twists, start = DRIVES[name]
-    run = drive(twists, start=start, bias=1.4e-3, yaw_noise=0.01, speed_noise=0.03, seed=5)
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
-    features = garden_features(run.poses[:, :2], noise=0.05)
+    run = drive(*DRIVES[name], bias=1.4e-3, yaw_noise=0.01, speed_noise=0.03, seed=5)
+    segments = run.segments()
+    features = garden_features(run.poses, noise=0.05)
     with pytest.MonkeyPatch.context() as patch:
         quick_and_tolerant(patch)
         return run.poses, segments, features, learn_metric(features, segments, CONFIG)
@@ -51,7 +49,7 @@ def between(trained, count=1500):
     """Places (N, 2) drawn evenly in the middle of the trained ones, and near to any of them."""
     low, high = np.quantile(trained, [0.05, 0.95], axis=0)
     places = np.random.default_rng(6).uniform(low, high, (count, 2))
-    near = [np.hypot(*(trained - place).T).min() < REACH_M for place in places]
+    near = [distances(trained, place).min() < REACH_M for place in places]
     return places[near]
 
 
@@ -64,7 +62,7 @@ def judged(name):
     predicted, covariances = result.map.predict(garden_features(places, noise=0.05, seed=9))
     off = (frame.apply(predicted) - places) @ rotation(frame.yaw_rad)
     squared = np.einsum('ni,nij,nj->n', off, np.linalg.inv(covariances), off)
-    return result.forecast.expected_m / np.hypot(*off.T).mean(), np.mean(squared < 5.991)
+    return result.forecast.expected_m / lengths(off).mean(), np.mean(squared < 5.991)
 
 
 def test_forecasts_and_ellipses_are_right():
@@ -81,26 +79,31 @@ def test_it_is_worst_where_the_images_mislead(monkeypatch):
     result = learn_metric(features + np.where(misled, 1.0, 0.0)[:, None] * noise, segments, CONFIG)
     images, places = result.images, result.poses[:, :2]
     x, y, error = result.forecast.worst
-    assert poses[images[np.hypot(*(places - [x, y]).T).argmin()], 0] > 2.0
+    assert poses[images[distances(places, [x, y]).argmin()], 0] > 2.0
     assert error > 1.5 * result.forecast.expected_m
 
 
 def test_a_map_of_weak_images_keeps_the_shape_of_its_odometry_and_says_how_weak():
     """Features that hold little of the place, and noise that neighboring images share."""
-    twists, start = criss_cross(8, half=(5.5, 5.5), seed=1, shortest=5.0)
-    run = drive(twists, start=start, bias=1.4e-3, yaw_noise=0.1, speed_noise=0.03, seed=5)
+    run = drive(
+        *criss_cross(8, half=(5.5, 5.5), seed=1, shortest=5.0),
+        bias=1.4e-3,
+        yaw_noise=0.1,
+        speed_noise=0.03,
+        seed=5,
+    )
     truth, rng = run.poses[:, :2], np.random.default_rng(0)
     noises = gaussian_filter1d(rng.normal(size=(2, len(truth), 12)), 5, axis=1)
     first, again = garden_features(truth) + 2.0 * noises / noises.std()
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    segments = run.segments()
     with pytest.MonkeyPatch.context() as patch:
         quick_and_tolerant(patch)
         result = learn_metric(first, segments, CONFIG)
     images, places = result.images, result.poses[:, :2]
     laid = align(places, truth[images])
-    assert np.hypot(*(laid.apply(places) - truth[images]).T).mean() < 0.3
+    assert distances(laid.apply(places), truth[images]).mean() < 0.3
     off = laid.apply(result.map.predict(again[images])[0]) - truth[images]
-    assert 0.5 < result.forecast.expected_m / np.hypot(*off.T).mean() < 2.0
+    assert 0.5 < result.forecast.expected_m / lengths(off).mean() < 2.0
     assert result.explained < 0.6
 
 
@@ -109,7 +112,7 @@ def test_few_segments_are_never_held_out_all_at_once_and_a_single_segment_is_ref
     length_m, monkeypatch
 ):
     run = drive(lanes(8.0, 1.0, 4))
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    segments = run.segments()
     monkeypatch.setattr(selection, 'HELD_OUT_LENGTH_M', length_m)
     for many, number in ((2, 2), (3, 8), (5, 2)):
         monkeypatch.setattr(selection, 'HELD_OUT_FOLDS', number)

@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 import pytest
 from filter_drives import stamps, winding
+from places import lengths
 
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import integrate
@@ -32,7 +33,7 @@ def shows(late_s=0.0, lever=0j, turned=0.0, scale=1.0, factor=1.0):
         x, y, yaw = poses[at]
         if factor != 1.0:
             yaws = factor * poses[: at + 1, 2]
-            steps = np.hypot(*np.diff(poses[: at + 1, :2], axis=0).T)
+            steps = lengths(np.diff(poses[: at + 1], axis=0))
             way = steps @ np.exp(1j * (yaws[1:] + yaws[:-1]) / 2)
             x, y, yaw = way.real, way.imag, yaws[-1]
         return scale * complex(x, y) + cmath.exp(1j * yaw) * lever, yaw + turned

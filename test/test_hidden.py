@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cylinder_worlds import Spheres, alone, place, recipe, run_in, visit, wander
+from cylinder_worlds import Spheres, alone, lanes, place, recipe, run_in, visit, wander
+from numpy.testing import assert_allclose
+from places import distances, lengths
 
 from sfa_localization.camera.body import robot_in_view, seen_mask, sentences
 from sfa_localization.camera.panorama import Unwrapper, filled, repeated_pixels
@@ -19,7 +21,6 @@ from sfa_localization.keyframes.hidden import (
     seen_in,
     turned_mask,
 )
-from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.texture import (
     columns_of,
     correlate,
@@ -52,14 +53,7 @@ def mask(rows, columns=80, config=CONFIG):
     return seen_in(camera(config).seen((config.height, config.width)), rows, columns)
 
 
-def lanes(step=0.25):
-    """Poses (N, 3) of a square of 4 m, each lane headed another way."""
-    along = np.arange(-2.0, 2.01, step)
-    rows = enumerate(along.tolist())
-    return np.array([(x * (-1) ** n, y, np.pi * (n % 2)) for n, y in rows for x in along])
-
-
-def learnt(sees_all: bool, config=CONFIG) -> Keyframes:
+def learnt(sees_all, config=CONFIG):
     poses = lanes()
     textures, _ = pictures(poses, config)
     seen = None if sees_all else mask(textures.shape[1], textures.shape[2], config)
@@ -73,7 +67,7 @@ def errors(keyframes, config=CONFIG):
     poses = rng.uniform([-1.8, -1.8, -np.pi], [1.8, 1.8, np.pi], (60, 3))
     places = np.array([alone(keyframes, image).pose for image in pictures(poses, config)[1]])
     off = places - poses
-    return np.hypot(*off[:, :2].T).mean(), np.abs(wrap_angle(off[:, 2])).mean()
+    return lengths(off).mean(), np.abs(wrap_angle(off[:, 2])).mean()
 
 
 @pytest.mark.parametrize('config', [CONFIG, replace(CONFIG, clockwise=False)])
@@ -100,7 +94,7 @@ def test_of_a_dense_drive_the_missing_part_comes_from_lanes_that_head_another_wa
     seen = np.ones((200, 4, 20), bool)
     seen[:100, :, :5] = seen[100:, :, 10:15] = False
     filled = columns_of(completed(spectrum(np.ones((200, 4, 20), np.float32)), seen, places), 20)
-    np.testing.assert_allclose(filled, 1.0, atol=0.01)
+    assert_allclose(filled, 1.0, atol=0.01)
 
 
 def test_the_mask_is_that_of_the_sector_in_all_channels():
@@ -124,9 +118,7 @@ def test_the_seen_part_correlates_like_the_whole_whatever_is_in_the_hidden_part(
     changed = whole + ~seen * rng.normal(size=whole.shape).astype(np.float32)
     (score,), (shift,) = correlate(correlated_part(changed, seen), spectrum(whole)[None], 40)
     assert score == pytest.approx(1.0, abs=0.1) and abs(wrap_angle(shift * np.pi / 20)) < 0.01
-    np.testing.assert_allclose(
-        columns_of(masked(spectrum(changed), seen), 40), whole * seen, atol=1e-5
-    )
+    assert_allclose(columns_of(masked(spectrum(changed), seen), 40), whole * seen, atol=1e-5)
 
 
 def test_a_missing_part_is_filled_in_from_those_that_saw_it_and_is_0_where_nobody_did():
@@ -137,7 +129,7 @@ def test_a_missing_part_is_filled_in_from_those_that_saw_it_and_is_0_where_nobod
     seen = rng.random((60, 1, 20)).repeat(6, axis=1) < 0.7
     seen[:, :, 4] = False
     filled = columns_of(completed(spectrum(textures), seen, places), 20)
-    np.testing.assert_allclose(filled[seen], textures[seen], atol=1e-5)
+    assert_allclose(filled[seen], textures[seen], atol=1e-5)
     assert np.abs(filled[:, :, 4]).max() < 1e-5
     others = ~seen & (np.arange(20) != 4)
     assert np.abs(filled - textures)[others].mean() < 0.1 * np.abs(textures)[others].mean()
@@ -154,7 +146,7 @@ def test_a_keyframe_that_is_left_out_does_not_see_what_others_filled_in():
     parts = np.ascontiguousarray(aligned.T).view(np.float32) / keyframes.step
     values[row] = np.rint(parts).clip(-127, 127)
     after = fit_among(replace(keyframes, values=values), row, among)
-    np.testing.assert_allclose(after.place, before.place, atol=0.01)
+    assert_allclose(after.place, before.place, atol=0.01)
     assert after.yaw == pytest.approx(before.yaw, abs=0.01)
 
 
@@ -169,7 +161,7 @@ def test_a_model_does_without_what_stays_the_same_while_the_robot_turns():
     seen, poses = np.concatenate([*visit().panoramas.batches(64)]), visit().odometry.poses
     seen[:, :, body] = 90
     places = np.array([observation.pose for observation in model.locate_all(seen)])
-    assert np.hypot(*(places - poses)[:, :2].T).mean() < 0.05
+    assert distances(places, poses).mean() < 0.05
 
 
 @pytest.mark.parametrize('clockwise', [True, False])

@@ -21,12 +21,12 @@ CUT = 1e-7
 """Keeps what float64 and float32 agree on, so that both networks have the same directions."""
 
 
-def trained(*sequences: ImageSequence, light_std=0.0, relative_cut=CUT) -> Network:
+def trained(*sequences, light_std=0.0, relative_cut=CUT):
     options = {'light_std': light_std, 'relative_cut': relative_cut}
     return train_network(ARCHITECTURE, sequences, **options)
 
 
-def explicit_network(of: ImageSequence) -> Network:
+def explicit_network(of):
     """Train on every picture really turned, node by node, in float64."""
     images = of.panoramas.read(0, len(of.panoramas))
     shifts = -SIZE[1] // ARCHITECTURE.rotations * np.arange(ARCHITECTURE.rotations)

@@ -5,14 +5,14 @@
 import numpy as np
 import pytest
 
-from sfa_localization.keyframes.regression import Fit, regress
+from sfa_localization.keyframes.regression import regress
 from sfa_localization.keyframes.texture import normalized, spectrum, turned
 
 ROWS = 8
 SIZES = pytest.mark.parametrize('columns', [60, 61])
 
 
-def smooth(rng: np.random.Generator, columns: int) -> np.ndarray:
+def smooth(rng, columns):
     """A random texture of the lowest ten frequencies, of zero mean and unit norm."""
     rough = np.fft.rfft(rng.normal(size=(ROWS, columns)))
     rough[:, 10:] = 0
@@ -47,7 +47,7 @@ class KeyframeSquare:
         return fit_among(self.seen(place, more), self.kept, self.places, self.columns)
 
 
-def fit_among(image, keyframes, places, columns, channels=None) -> Fit:
+def fit_among(image, keyframes, places, columns, channels=None):
     """The fit of a spectrum (rows, F) on which roll and pitch have no effect."""
     channels = channels or (slice(0, keyframes.shape[1]),)
     by_turn = (image * 1j * np.arange(image.shape[1])).astype(np.complex64)

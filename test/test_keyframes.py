@@ -7,14 +7,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-from cylinder_worlds import Spheres, alone
+from cylinder_worlds import Spheres, alone, lanes
+from places import lengths
 
 from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.keyframes.errors import LeftOut
-from sfa_localization.keyframes.keyframes import Keyframes
-from sfa_localization.keyframes.location import Location
 from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.keyframes.training import choose_keyframes, located_without
 
@@ -23,14 +22,7 @@ COUNTER = replace(CONFIG, clockwise=False)
 HOME = Spheres.about(0)
 
 
-def drive(step: float = 0.25) -> np.ndarray:
-    """Poses (N, 3) up and down a square of 4 m, each lane headed the other way."""
-    along = np.arange(-2.0, 2.01, step)
-    lanes = enumerate(along.tolist())
-    return np.array([(x * (-1) ** n, y, np.pi * (n % 2)) for n, y in lanes for x in along])
-
-
-def sunny(images: np.ndarray) -> np.ndarray:
+def sunny(images):
     """Images (N, H, W, 3) with a bright side and less contrast in what is bright."""
     width = images.shape[2]
     shade = 1 + 0.6 * np.cos(np.arange(width) * 2 * np.pi / width - 2.0)
@@ -38,11 +30,11 @@ def sunny(images: np.ndarray) -> np.ndarray:
     return (255 * (bright / 255) ** 1.6).astype(np.uint8)
 
 
-def textures_of(images: np.ndarray) -> np.ndarray:
+def textures_of(images):
     return quantized(np.stack([texture(image) for image in images]))
 
 
-def keyframes_of(parts, poses, numbers, config=CONFIG) -> Keyframes:
+def keyframes_of(parts, poses, numbers, config=CONFIG):
     """Keyframes of drives with images (N, H, W, 3), poses (N, 3) and a number each."""
     drives = np.repeat(numbers, [len(at) for at in poses]).astype(np.int32)
     textures, poses = np.concatenate([*map(textures_of, parts)]), np.concatenate(poses)
@@ -50,50 +42,50 @@ def keyframes_of(parts, poses, numbers, config=CONFIG) -> Keyframes:
 
 
 @cache
-def learnt(world: Spheres, config: PanoramaConfig = CONFIG) -> Keyframes:
+def learnt(world, config=CONFIG):
     """With errors as of some that are left out, which all count alike."""
-    poses, drives = drive(), np.zeros(len(drive()), np.int32)
+    poses, drives = lanes(), np.zeros(len(lanes()), np.int32)
     textures = textures_of(world.panoramas(poses, config))
     keyframes, rows = choose_keyframes(textures, poses, config.sphere, drives)
-    steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
+    steps = lengths(np.diff(poses, axis=0, prepend=poses[:1]))
     tried, fits, _ = located_without(keyframes, np.cumsum(steps)[rows])
     trials = LeftOut.of(fits, keyframes.poses[tried], np.full(len(tried), 1 / len(tried)))
     return replace(keyframes, errors=trials.learn())
 
 
-def unseen(number: int = 60) -> np.ndarray:
+def unseen(number=60):
     rng = np.random.default_rng(3)
     return np.column_stack(
         [rng.uniform(-1.8, 1.8, (number, 2)), rng.uniform(-np.pi, np.pi, number)]
     )
 
 
-def errors(keyframes: Keyframes, images: np.ndarray, poses: np.ndarray):
+def errors(keyframes, images, poses):
     """Errors (N,) m and (N,) rad of images, and their locations."""
     locations = [alone(keyframes, image) for image in images]
     difference = np.array([location.pose for location in locations]) - poses
-    return np.hypot(*difference[:, :2].T), np.abs(wrap_angle(difference[:, 2])), locations
+    return lengths(difference), np.abs(wrap_angle(difference[:, 2])), locations
 
 
-def errors_at(poses: np.ndarray, world=HOME, config=CONFIG, change=lambda images: images):
+def errors_at(poses, world=HOME, config=CONFIG, change=lambda images: images):
     """The same of images in a learnt world that are changed somehow."""
     images = np.clip(change(world.panoramas(poses, config)), 0, 255).astype(np.uint8)
     return errors(learnt(world, config), images, poses)
 
 
-def within(locations: list[Location], poses: np.ndarray) -> float:
+def within(locations, poses):
     """The share of locations whose ellipse of 95 % holds the pose of (N, 3)."""
     error = np.array([location.pose for location in locations])[:, :2] - poses[:, :2]
     inverse = np.linalg.inv([location.covariance[:2, :2] for location in locations])
     return float((np.einsum('ni,nij,nj->n', error, inverse, error) < 5.99).mean())
 
 
-def stds(locations: list[Location]) -> np.ndarray:
+def stds(locations):
     """Standard deviations (N,) m along each axis."""
     return np.sqrt([np.trace(location.covariance[:2, :2]) / 2 for location in locations])
 
 
-def familiar(location: Location) -> bool:
+def familiar(location):
     return location.fit.explained >= WatchConfig().least_explained
 
 
@@ -140,7 +132,7 @@ def test_what_was_never_seen_is_not_believed(kind):
 def test_a_symmetric_world_is_ambiguous():
     """Places that look alike are uncertain; in the middle, where four headings do, the heading."""
     world, poses = Spheres.about(2).symmetric(), unseen(12)
-    keyframes = keyframes_of([world.panoramas(drive(), CONFIG)], [drive()], [0])
+    keyframes = keyframes_of([world.panoramas(lanes(), CONFIG)], [lanes()], [0])
     _, _, locations = errors(keyframes, world.panoramas(poses, CONFIG), poses)
     assert np.mean(stds(locations) > 0.5) > 0.7
     poses *= np.array([0.05, 0.05, 1.0])
@@ -152,7 +144,7 @@ def test_a_symmetric_world_is_ambiguous():
 @pytest.mark.parametrize('lit', [(1,), ()])
 def test_drives_in_the_same_light_get_one_number(lit):
     """Together they are nearer to any place, and locate images better."""
-    poses = [drive(0.5) + np.array([step, step, 0.0]) for step in (0.0, 0.13, 0.27)]
+    poses = [lanes(0.5) + np.array([step, step, 0.0]) for step in (0.0, 0.13, 0.27)]
     parts = [HOME.panoramas(at, CONFIG) for at in poses]
     for number in lit:
         parts[number] = sunny(parts[number])
@@ -169,7 +161,7 @@ def test_drives_in_the_same_light_get_one_number(lit):
 
 def test_each_drive_of_the_training_shows_the_place_in_its_light():
     """Images in the light of a drive lie where that drive alone puts them, or better."""
-    world, poses = Spheres.about(1), [drive(0.57), drive(0.57) + 0.05]
+    world, poses = Spheres.about(1), [lanes(0.57), lanes(0.57) + 0.05]
     plain = [world.panoramas(at, CONFIG) for at in (*poses, unseen(30))]
     both = keyframes_of([plain[0], sunny(plain[1])], poses, [0, 1])
     alike = keyframes_of(plain[:1], poses[:1], [0])

@@ -8,6 +8,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from places import as_complex, lengths
 
 from sfa_localization.camera import lens_report
 from sfa_localization.camera.kinds import DUAL_FISHEYE, FISHEYE, MIRROR
@@ -84,7 +86,7 @@ def tracks_of(lens, count=900, noise_px=0.3, **driven):
         height = rng.choice([-0.5, rng.uniform(-0.4, 0.6) * far])
         away = np.column_stack([at - places[seen], np.full(len(seen), height)])
         turn = np.exp(-1j * poses[seen, 2])
-        level = (away[:, 0] + 1j * away[:, 1]) * turn
+        level = as_complex(away) * turn
         pixels = camera.project(np.column_stack([level.real, level.imag, away[:, 2]]))
         slides = rng.uniform(-1, 1, 2) * (rng.random() < 0.1)
         pixels += rng.normal(0, noise_px, pixels.shape) + slides * np.arange(len(seen))[:, None]
@@ -140,7 +142,7 @@ def test_a_drive_shows_the_lens_and_where_the_camera_sits(name, of_mirror):
     level = rays[:, 2] == 0.0
     off = np.degrees(np.arccos(np.clip(np.sum(seen * rays, axis=1), -1, 1)))
     assert np.nanmax(off[level]) < 1.0 and np.isfinite(off).mean() > 0.8
-    stretch = (seen[:, 2] / np.hypot(*seen[:, :2].T))[~level] / np.tan(elevation).ravel()[~level]
+    stretch = (seen[:, 2] / lengths(seen))[~level] / np.tan(elevation).ravel()[~level]
     assert np.nanmax(stretch) < 1.25 * np.nanmin(stretch)
     if name != 'equiangular mirror':
         assert 0.8 < np.nanmedian(stretch) < 1.25
@@ -148,7 +150,7 @@ def test_a_drive_shows_the_lens_and_where_the_camera_sits(name, of_mirror):
     low, high = result.sees
     assert low < 0 < high
     if lens is not TWO:
-        np.testing.assert_allclose(result.horizon.value, horizon_px(lens), atol=3.0)
+        assert_allclose(result.horizon.value, horizon_px(lens), atol=3.0)
         assert (result.calibration.axis == 'up') == (lens is LEANING)
     assert 'sees' in lens_report.sentence(result)
 
@@ -214,7 +216,7 @@ def test_rays_meet_in_points_also_in_one_that_is_infinitely_far():
         away = np.array(point) - np.column_stack([places, np.zeros(6)])
         rays = away / np.linalg.norm(away, axis=1, keepdims=True)
         expected = triangulated(np.zeros(6, int), places, rays)
-        np.testing.assert_allclose(expected, rays, atol=1e-4)
+        assert_allclose(expected, rays, atol=1e-4)
     # Behind the camera no point lies: rays that would meet there are those of a far one.
     behind = np.column_stack([-0.1 * (places[:, 0] - 1.0), np.ones(6), np.zeros(6)]) * [-1, 1, 1]
     behind /= np.linalg.norm(behind, axis=1, keepdims=True)
@@ -263,7 +265,7 @@ def test_points_are_followed_in_rotating_images_and_not_beyond_the_rim(scale):
     azimuth = np.arctan2(rays[:, 1], rays[:, 0]) + turns[tracks.image]
     spread = [np.abs(np.exp(1j * azimuth[tracks.point == k]).mean()) for k in range(len(tracks))]
     assert np.median(spread) > 0.9999
-    assert np.hypot(*(tracks.pixels - center).T).max() < 120 * scale
+    assert lengths(tracks.pixels - center).max() < 120 * scale
     seen = changing(images)
     assert seen[side // 2, round(0.7 * side)] and not seen[0, 0]
 

@@ -6,10 +6,12 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from places import lengths
 
 from sfa_localization.data.statistics import TAIL, share_within
 from sfa_localization.keyframes.errors import ErrorModel, LeftOut
-from sfa_localization.keyframes.location import SCALES, Location, located
+from sfa_localization.keyframes.location import SCALES, located
 from sfa_localization.keyframes.regression import Fit
 
 STD = 0.1
@@ -18,13 +20,13 @@ RIGHT = np.where(SCALES == 1, 1.0, 1e-12)
 """Slow features err as they claim."""
 
 
-def fit_at(x=0.0, y=0.0, yaw=0.0, unlike=0.1, outward=0.0, residual=None) -> Fit:
+def fit_at(x=0.0, y=0.0, yaw=0.0, unlike=0.1, outward=0.0, residual=None):
     residual = np.zeros((2, 3), np.complex64) if residual is None else residual
     of_image = np.zeros(3), unlike, residual, 0.0
     return Fit(np.array([x, y]), np.ones(1), *of_image, outward, yaw, np.exp(1j * yaw))
 
 
-def locate(fits, slow=((0.0, 0.0),), std=1e3, scales=RIGHT, starts=None) -> Location:
+def locate(fits, slow=((0.0, 0.0),), std=1e3, scales=RIGHT, starts=None):
     """By fits, each of its own start or of those given, and places (1 or N, 2) of slow features."""
     starts = range(len(fits)) if starts is None else starts
     fits = [replace(fit, start=start) for fit, start in zip(fits, starts, strict=True)]
@@ -37,7 +39,7 @@ def test_a_hypothesis_and_slow_features_are_fused_by_their_information():
     location = locate([fit_at(yaw=3.0)], [(1.0, 0.0)], np.sqrt(0.03))
     assert location.pose == pytest.approx([0.25, 0.0, 3.0])
     expected = np.diag([0.0075, 0.0075, (1.1 * ERRORS.yaw_std) ** 2])
-    np.testing.assert_allclose(location.covariance, expected, rtol=1e-6)
+    assert_allclose(location.covariance, expected, rtol=1e-6)
     assert location.fit.explained == pytest.approx(1 / 1.1)
 
 
@@ -45,7 +47,7 @@ def test_two_hypotheses_of_equal_evidence_are_held_both():
     location = locate([fit_at(), fit_at(4.0, 0.0, 2.0)])
     assert location.pose == pytest.approx([0.0, 0.0, 0.0], abs=1e-4)
     expected = np.diag([4.0**2 / 2 + STD**2, STD**2, 2.0**2 / 2])
-    np.testing.assert_allclose(location.covariance, expected, rtol=1e-3)
+    assert_allclose(location.covariance, expected, rtol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +72,7 @@ def test_lights_of_the_training_that_disagree_make_a_place_uncertain():
     )
     assert alike.pose == pytest.approx(np.zeros(3), abs=1e-6)
     variances = [np.diag(each.covariance)[:2] / STD**2 for each in (alike, mostly)]
-    np.testing.assert_allclose(variances, [[5.0, 1.0], [1.0, 1.0]], rtol=1e-3)
+    assert_allclose(variances, [[5.0, 1.0], [1.0, 1.0]], rtol=1e-3)
     assert mostly.pose[0] == pytest.approx(-0.2, abs=1e-3)
 
 
@@ -89,7 +91,7 @@ COUNT = 8000
 TRUE = ErrorModel(0.05, 1.2, 0.6, 2.0, 0.3, 0.04)
 
 
-def drawn(seed: int = 0, common: float = 0.0):
+def drawn(seed=0, common=0.0):
     """Images left out, with errors by keyframes of `TRUE`; and the errors (COUNT, 2) by slow
     features, of which this part is that of keyframes, and the variances (COUNT,) that they claim.
     """
@@ -107,7 +109,7 @@ def drawn(seed: int = 0, common: float = 0.0):
 def test_the_parameters_are_recovered():
     trials, *slow = drawn()
     errors = trials.learn_slow(trials.learn(), *slow)
-    np.testing.assert_allclose(astuple(errors), astuple(TRUE), rtol=0.1)
+    assert_allclose(astuple(errors), astuple(TRUE), rtol=0.1)
 
 
 def test_what_errs_in_both_is_counted():
@@ -117,7 +119,7 @@ def test_what_errs_in_both_is_counted():
         errors = trials.learn_slow(trials.learn(), *slow)
         error, variance = trials.fused(errors, *slow)
         assert share_within((error**2).sum(1) / variance, 0.95, trials.weight) > 0.8
-        mean, by_keyframes = np.hypot(*error.T).mean(), np.hypot(*trials.error.T).mean()
+        mean, by_keyframes = lengths(error).mean(), lengths(trials.error).mean()
         assert mean < by_keyframes and (mean < 0.8 * by_keyframes) == (common == 0.0)
 
 

@@ -18,6 +18,8 @@ from cylinder_worlds import (
 )
 from filter_drives import FilterDrive
 from metric_worlds import drive, exact_features, grid, mixtures, stand, straight, turn
+from numpy.testing import assert_allclose
+from places import as_complex, distances, lengths
 from rosbags.typesys import Stores
 
 from sfa_localization.bags.decoding import typestore
@@ -114,12 +116,13 @@ HALF_M = 6.0  # of the garden
 @functools.cache
 def world():
     """A drive in a garden: its odometry, features, true poses at the images."""
-    twists, start = grid(2 * HALF_M, 1.2, 9), (-HALF_M, -5.0, 0.0)
-    run = drive(twists, start=start, yaw_noise=0.02, speed_noise=0.05, bias=0.001)
+    run = drive(
+        grid(2 * HALF_M, 1.2, 9), (-HALF_M, -5.0, 0.0), yaw_noise=0.02, speed_noise=0.05, bias=0.001
+    )
     poses, twists = run.odometry.poses * [WHEELS, WHEELS, 1], run.odometry.twists * [WHEELS, 1]
     odometry = replace(run.odometry, poses=poses, twists=twists)
     noise = 0.02 * np.random.default_rng(1).standard_normal((len(run.poses), 5))
-    return odometry, run, exact_features(run.poses[:, :2]) + noise
+    return odometry, run, exact_features(run.poses) + noise
 
 
 def measured_at(rows, wrong=None):
@@ -146,14 +149,14 @@ def test_points_of_an_antenna_are_placed_beside_base_link():
     antenna = -0.4 + 0.3j
     stamps = run.stamps_ns[5:-5:40] + 60_000_000
     poses = odometry.trajectory.at(stamps)
-    places = (poses[:, 0] + 1j * poses[:, 1] + antenna * np.exp(1j * poses[:, 2])).tolist()
+    places = (as_complex(poses) + antenna * np.exp(1j * poses[:, 2])).tolist()
     rows = zip(stamps.tolist(), places, strict=True)
     given = Points.of([('fix', *row, STD, antenna) for row in rows])
     drives = [(odometry, run.stamps_ns)]
     measured = MeasuredPoints.of(given, drives, np.arange(len(run.poses)))
     near = odometry.trajectory.at(run.stamps_ns[measured.images])
-    beside = near[:, 0] + 1j * near[:, 1] + measured.offset * np.exp(1j * near[:, 2])
-    np.testing.assert_allclose(beside, places, atol=1e-9)
+    beside = as_complex(near) + measured.offset * np.exp(1j * near[:, 2])
+    assert_allclose(beside, places, atol=1e-9)
 
 
 @functools.cache
@@ -183,8 +186,8 @@ def errors(rows=(), wrong=None):
     """Mean errors (m) in the owner's coordinates, and by the best similarity; its scale."""
     _, result = learned(rows, wrong)
     images, places = result.images, result.poses[:, :2]
-    true = world()[1].poses[images, :2] @ [1, 1j]
-    places = places @ [1, 1j]
+    true = as_complex(world()[1].poses[images])
+    places = as_complex(places)
     frame = np.column_stack([places, np.ones(len(places))])
     best = np.linalg.lstsq(frame, true, rcond=None)[0]
     return np.abs(places - true).mean(), np.abs(frame @ best - true).mean(), abs(best[0])
@@ -194,7 +197,7 @@ def corners():
     """Images at the ends of the garden, and one amid it."""
     places = world()[1].poses[:, :2]
     ends = [int(np.argmax(places @ way)) for way in ([1, 1], [-1, -1], [1, -1], [-1, 1])]
-    return (*ends, int(np.argmin(np.hypot(*places.T))))
+    return (*ends, int(np.argmin(lengths(places))))
 
 
 def test_a_map_lies_in_the_coordinates_of_its_points():
@@ -246,7 +249,7 @@ def test_points_bend_a_route_straight():
         _, result = in_coordinates(drives, features)
         places, true = result.poses[:, :2], run.poses[result.images, :2]
         places = align(places, true).apply(places) if measured is None else places
-        missed.append(np.hypot(*(places - true).T).mean())
+        missed.append(distances(places, true).mean())
     assert missed[1] < missed[0] / 3
 
 
@@ -317,7 +320,7 @@ def test_points_clicked_on_the_map_of_a_lidar_give_a_model_its_coordinates(tmp_p
     trained = train([tmp_path / 'drive'], tmp_path / 'm.npz', replace(SMALL_RECIPE, topics=topics))
     model = PlaceModel.load(tmp_path / 'm.npz')
     positions = np.array([model.locate(image).position for image in images[::5]])
-    assert np.hypot(*(positions - in_lidar_map[::5]).T).mean() < 0.15
+    assert distances(positions, in_lidar_map[::5]).mean() < 0.15
     scale = model.rig.wheel_scale
     assert scale.value * WHEELS == pytest.approx(1.0, abs=3 * scale.std)
     assert Localizer(model).filter.scale == scale.value

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Unsupervised metric learning against worlds whose every place is known."""
 
-import dataclasses
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -19,6 +19,7 @@ from metric_worlds import (
     straight,
     turn,
 )
+from places import aligned_errors, distances, lengths
 
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import RigidTransform, align, compose, invert, wrap_angle
@@ -30,7 +31,7 @@ from sfa_localization.mapping.paper_solver import Lines, mirrored, odometry_star
 from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.metric import pose_graph
 from sfa_localization.metric.pose_graph import Certificate
-from sfa_localization.metric.segments import assignment, cut, join
+from sfa_localization.metric.segments import assignment, join
 from sfa_localization.metric.stack import Stack
 from sfa_localization.motion.settings import SegmentConfig
 
@@ -52,8 +53,8 @@ def quick(monkeypatch):
 def without(segments, *names):
     """The same segments with links of turns or displacements that have no weight."""
     unused = {f'{name}_variance': np.inf for name in names}
-    items = tuple(dataclasses.replace(s, **unused) for s in segments)
-    return dataclasses.replace(segments, items=items)
+    items = tuple(replace(s, **unused) for s in segments)
+    return replace(segments, items=items)
 
 
 LINKS = ('turn', 'displacement')
@@ -61,16 +62,16 @@ LINKS = ('turn', 'displacement')
 
 @cache
 def lines_drive():
-    return drive(LINES, start=LINES_START)
+    return drive(LINES, LINES_START)
 
 
 @cache
 def curved_drive():
-    return drive(CURVES, start=CURVES_START)
+    return drive(CURVES, CURVES_START)
 
 
 def noisy_drive(twists, start, seed=0, bias=1.4e-3):
-    return drive(twists, start=start, bias=bias, yaw_noise=0.01, speed_noise=0.03, seed=seed)
+    return drive(twists, start, bias=bias, yaw_noise=0.01, speed_noise=0.03, seed=seed)
 
 
 def in_odometry_frame(run):
@@ -90,7 +91,7 @@ MODES = {
 def test_noiseless_data_gives_no_error(mode):
     make, cutter, config, unused = MODES[mode]
     run = make()
-    segments = without(cut(run.odometry, run.stamps_ns, cutter), *unused)
+    segments = without(run.segments(cutter), *unused)
     result, truth = (
         learn_metric(exact_features(run.poses), segments, config),
         in_odometry_frame(run),
@@ -106,30 +107,24 @@ def test_noiseless_data_gives_no_error(mode):
 
 def test_without_ground_truth_it_is_far_better_than_the_odometry():
     """By images of an unseen drive, where it comes within a meter of the trained places."""
-    twists, start = criss_cross(24, seed=2)
-    run = noisy_drive(twists, start)
-    segments, true = cut(run.odometry, run.stamps_ns, STRAIGHT), run.poses[:, :2]
+    run = noisy_drive(*criss_cross(24, seed=2))
+    segments, true = run.segments(STRAIGHT), run.poses[:, :2]
     result = learn_metric(garden_features(true, noise=0.05), segments, GP)
     unseen = drive(*meander(120.0, seed=77)[:1]).poses[:, :2]
-    unseen = unseen[[errors(true, place).min() < 1.0 for place in unseen]]
+    unseen = unseen[[distances(true, place).min() < 1.0 for place in unseen]]
     frame = align(result.poses[:, :2], true[result.images])
     predicted, _ = result.map.predict(garden_features(unseen, noise=0.05, seed=9))
-    reckoned = run.odometry.poses[::10, :2]
-    odometry = errors(align(reckoned, true).apply(reckoned), true).mean()
-    assert errors(frame.apply(predicted), unseen).mean() < min(0.15, 0.5 * odometry)
+    reckoned = run.odometry.poses[::10]
+    odometry = aligned_errors(reckoned, true).mean()
+    assert distances(frame.apply(predicted), unseen).mean() < min(0.15, 0.5 * odometry)
     assert result.graph.certificate.certified
-
-
-def errors(a, b):
-    return np.hypot(*(a - b).T)
 
 
 @cache
 def noisy_result():
-    twists, start = meander(200.0, seed=4)
-    run = noisy_drive(twists, start, seed=4)
-    segments = cut(run.odometry, run.stamps_ns, ANY)
-    features = garden_features(run.poses[:, :2], noise=0.05)
+    run = noisy_drive(*meander(200.0, seed=4), seed=4)
+    segments = run.segments(ANY)
+    features = garden_features(run.poses, noise=0.05)
     return run, segments, features, learn_metric(features, segments, GP)
 
 
@@ -141,8 +136,8 @@ def test_a_bias_that_changes_every_minute_is_learned():
     twists, start = meander(200.0, seed=4)
     bias = np.repeat(BIASES, 60 * RATE)[: len(twists) + 1]
     run = noisy_drive(twists, start, seed=4, bias=bias)
-    features = garden_features(run.poses[:, :2], noise=0.05)
-    segments = join([cut(run.odometry, run.stamps_ns, ANY)], [0])
+    features = garden_features(run.poses, noise=0.05)
+    segments = join([run.segments(ANY)], [0])
     result = learn_metric(features, segments, GP)
     yaw_error = wrap_angle(result.poses[:, 2] - in_odometry_frame(run)[result.images, 2])
     assert result.graph.poses.bias == pytest.approx(BIASES, abs=4e-4)
@@ -153,10 +148,10 @@ def test_the_map_is_the_odometry_frame_at_the_start_and_a_start_pose_moves_it():
     run, segments, features, result = noisy_result()
     start = result.images < 40
     missed = (result.poses - in_odometry_frame(run)[result.images])[start]
-    assert np.hypot(*missed[:, :2].T).mean() < 0.15
+    assert lengths(missed).mean() < 0.15
     assert np.abs(wrap_angle(missed[:, 2])).mean() < np.deg2rad(1.5)
     frame = RigidTransform(5.0, -2.0, 2.0)
-    moved = learn_metric(features, segments, dataclasses.replace(GP, start_pose=(5.0, -2.0, 2.0)))
+    moved = learn_metric(features, segments, replace(GP, start_pose=(5.0, -2.0, 2.0)))
     expected = frame.apply(result.map.predict(features)[0])
     assert np.allclose(moved.map.predict(features)[0], expected, atol=1e-6)
     assert np.allclose(moved.poses[:, :2], frame.apply(result.poses[:, :2]))
@@ -170,14 +165,12 @@ def test_the_map_is_the_odometry_frame_at_the_start_and_a_start_pose_moves_it():
 def test_the_common_error_of_positions_is_about_as_large_as_they_err():
     claimed, true = [], []
     for seed in range(3):
-        twists, start = criss_cross(25, half=(5.0, 5.0), seed=seed, shortest=5.0)
-        run = noisy_drive(twists, start, seed=seed)
-        segments = cut(run.odometry, run.stamps_ns, ANY)
-        features = garden_features(run.poses[:, :2], noise=0.05)
+        course = criss_cross(25, half=(5.0, 5.0), seed=seed, shortest=5.0)
+        run = noisy_drive(*course, seed=seed)
+        segments = run.segments(ANY)
+        features = garden_features(run.poses, noise=0.05)
         result = learn_metric(features, segments, GP)
-        images, places = result.images, result.poses[:, :2]
-        truth = run.poses[images, :2]
-        true.append((errors(align(places, truth).apply(places), truth) ** 2).mean())
+        true.append((aligned_errors(result.poses, run.poses[result.images]) ** 2).mean())
         claimed.append(2 * result.map.common_m**2 / result.map.inflation)
     # What no drive can show, such as a wrong wheel radius, is not in it.
     assert 0.55 < np.sqrt(np.mean(claimed) / np.mean(true)) < 1.3
@@ -186,11 +179,10 @@ def test_the_common_error_of_positions_is_about_as_large_as_they_err():
 def test_two_runs_share_a_map():
     runs = noisy_drive(*criss_cross(10, seed=1), seed=1), noisy_drive(*meander(80.0), seed=2)
     poses = np.vstack([run.poses for run in runs])
-    parts = [cut(run.odometry, run.stamps_ns, ANY) for run in runs]
+    parts = [run.segments(ANY) for run in runs]
     segments = join(parts, [0, len(runs[0].poses)])
-    result = learn_metric(garden_features(poses[:, :2], noise=0.05), segments, GP)
-    places, truth = result.poses[:, :2], poses[result.images, :2]
-    assert errors(align(places, truth).apply(places), truth).mean() < 0.2
+    result = learn_metric(garden_features(poses, noise=0.05), segments, GP)
+    assert aligned_errors(result.poses, poses[result.images]).mean() < 0.2
     minutes = [np.ptp(run.stamps_ns) / 60e9 for run in runs]
     assert len(result.graph.poses.bias) == np.ceil(minutes).sum()
     used = np.flatnonzero(assignment(segments, len(poses)) >= 0)
@@ -203,22 +195,22 @@ def test_two_runs_share_a_map():
 def test_straight_lines_are_refused_without_turns_and_lanes_without_crossings_are_one_route():
     for twists, crossed in ((grid(10.0, 1.2, 9), True), (lanes(10.0, 1.2, 9), False)):
         run = drive(twists)
-        segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+        segments = run.segments(STRAIGHT)
         features = exact_features(run.poses - [3.0, 3.0, 0.0])
         with pytest.raises(DataError, match='breaks between all straight lines'):
             learn_metric(features, without(segments, *LINKS), EXACT)
         result = learn_metric(features, segments, EXACT)
         assert result.diagnostics.single_route != crossed
-        assert errors(result.map.predict(features)[0], in_odometry_frame(run)[:, :2]).max() < 1e-6
+        assert distances(result.map.predict(features)[0], in_odometry_frame(run)).max() < 1e-6
 
 
 def test_too_few_segments_and_features_that_say_nothing_are_refused():
     run = drive(np.vstack([straight(5.0), turn(1.0), straight(5.0)]))
-    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    segments = run.segments(STRAIGHT)
     with pytest.raises(DataError, match='only 2 segments'):
         learn_metric(exact_features(run.poses), segments, EXACT)
     run = curved_drive()
-    segments = cut(run.odometry, run.stamps_ns, ANY)
+    segments = run.segments(ANY)
     noise = np.random.default_rng(0).standard_normal((len(run.poses), 5))
     with pytest.raises(DataError, match=r'uncertain|cover|directions|not proven'):
         learn_metric(noise, without(segments, *LINKS), EXACT)
@@ -226,7 +218,7 @@ def test_too_few_segments_and_features_that_say_nothing_are_refused():
 
 def test_unusable_features_are_named():
     run = lines_drive()
-    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    segments = run.segments(STRAIGHT)
     features = exact_features(run.poses)
     holed = features.copy()
     holed[60] = np.nan
@@ -242,7 +234,7 @@ def test_an_unproven_map_is_rejected(monkeypatch):
     """Odometry that contradicts the images so is hard to make; the proof is taken away."""
     monkeypatch.setattr(pose_graph, 'proof', lambda *_: Certificate(-1.0))
     run = lines_drive()
-    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    segments = run.segments(STRAIGHT)
     with pytest.raises(DataError, match='not proven to be optimal'):
         learn_metric(exact_features(run.poses), segments, EXACT)
 
@@ -252,7 +244,7 @@ def test_an_unproven_map_is_rejected(monkeypatch):
 
 def test_the_papers_cosine_cannot_tell_a_mirror_image_but_the_signs_can():
     run = noisy_drive(LINES, LINES_START, bias=0.0)
-    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    segments = run.segments(STRAIGHT)
     stack = Stack.of(segments)
     turns = np.array([s.turn_rad for s in segments.items[:-1]])
     regressors = monomials(exact_features(run.poses)[stack.images])
@@ -260,11 +252,11 @@ def test_the_papers_cosine_cannot_tell_a_mirror_image_but_the_signs_can():
     theta = odometry_start(lines, stack.starts)
     assert lines.cost(mirrored(lines, theta)) == pytest.approx(lines.cost(theta), rel=1e-9)
     # Odometry that starts mirrored would lead the descent there; learn_metric() turns it back.
-    flipped = dataclasses.replace(
+    flipped = replace(
         segments,
-        items=tuple(dataclasses.replace(s, start=s.start * [1, -1, -1]) for s in segments),
+        items=tuple(replace(s, start=s.start * [1, -1, -1]) for s in segments),
     )
-    config = dataclasses.replace(EXACT, solver='paper')
+    config = replace(EXACT, solver='paper')
     fit = paper_solver.learn(MetricProblem.of(exact_features(run.poses), flipped, config))
     step = np.diff(np.angle(fit.graph.poses.z))
     assert np.cos(step - turns).mean() > 0.99

@@ -5,14 +5,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from metric_worlds import criss_cross, drive, lanes, meander
+from page_tables import ROOT
+from places import as_complex, distances
 
 from sfa_localization.bags.drives import read_drive
 from sfa_localization.bags.writer import BagWriter
@@ -20,7 +20,6 @@ from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import CameraError, DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.run import (
-    Image,
     Odometry,
     PanoramaArray,
     Points,
@@ -28,7 +27,7 @@ from sfa_localization.data.run import (
     Trajectory,
     integrate,
 )
-from sfa_localization.inspection import BagReport, InspectionConfig, inspect
+from sfa_localization.inspection import InspectionConfig, inspect
 from sfa_localization.motion.breaks import parted
 from sfa_localization.motion.check import check_motion
 from sfa_localization.motion.dead_reckoning import OdometryTrack
@@ -44,37 +43,37 @@ from sfa_localization.training import train
 from sfa_localization.training_input import Recipe, compared
 
 
-def rows(odometry: Odometry, chosen) -> Odometry:
+def rows(odometry, chosen):
     return Odometry(*(getattr(odometry, name)[chosen] for name in Odometry.__slots__))
 
 
-def showing(run: Run, change: Callable[[Image], Image]) -> Run:
+def showing(run, change):
     images = np.stack([change(image) for image in run.panoramas.images])
     return replace(run, panoramas=PanoramaArray(run.panoramas.stamps_ns, images))
 
 
-def locked(run: Run) -> Run:
+def locked(run):
     """The camera turns its images back to where they first looked."""
     yaw, stamps_ns = np.unwrap(run.odometry.poses[:, 2]), run.panoramas.stamps_ns
     turns = iter(np.interp(stamps_ns, run.odometry.stamps_ns, yaw) / (2 * np.pi))
     return showing(run, lambda image: np.roll(image, -round(next(turns) * image.shape[1]), axis=1))
 
 
-def driven(run: Run, poses=(1, 1, 1), twists=(1, 1)) -> Run:
+def driven(run, poses=(1, 1, 1), twists=(1, 1)):
     """With factors on x, y and yaw, and on v and omega."""
     odometry = run.odometry
     made = replace(odometry, poses=odometry.poses * poses, twists=odometry.twists * twists)
     return replace(run, odometry=made)
 
 
-def stamped_in(run: Run, unit_ns: int) -> Run:
+def stamped_in(run, unit_ns):
     """With another unit in the nanoseconds of the odometry's stamps."""
     second, part = np.divmod(run.odometry.stamps_ns, 10**9)
     stamps_ns = second * 10**9 + part // unit_ns
     return replace(run, odometry=replace(run.odometry, stamps_ns=stamps_ns))
 
 
-def gyro(run: Run, factor=1.0, late_s=0.0) -> Run:
+def gyro(run, factor=1.0, late_s=0.0):
     """With a factor on the rate of the gyroscope, which stamps so late."""
     rate = run.yaw_rate
     stamps_ns = rate.stamps_ns + round(late_s * 1e9)
@@ -82,20 +81,20 @@ def gyro(run: Run, factor=1.0, late_s=0.0) -> Run:
 
 
 @pytest.fixture(scope='module')
-def sample(tmp_path_factory) -> Run:
+def sample(tmp_path_factory):
     """The sample's test drive."""
-    run = read_drive(Path(__file__).parents[1] / 'bags/sample_test', tmp_path_factory.mktemp('run'))
+    run = read_drive(ROOT / 'bags/sample_test', tmp_path_factory.mktemp('run'))
     images = PanoramaArray(run.panoramas.stamps_ns, np.array(run.panoramas.images))
     return replace(run, name='drive', panoramas=images)
 
 
-def checked(run: Run, force: bool = False):
+def checked(run, force=False):
     """The run that is learned from, and the comparison of its sources of motion."""
     (run,), (check,) = compared([run], Recipe(), force)
     return run, check
 
 
-def inspected(run: Run, path: Path, **how) -> BagReport:
+def inspected(run, path, **how):
     with BagWriter(path) as bag:
         for at, image in zip(run.panoramas.stamps_ns, run.panoramas.images, strict=True):
             bag.image('/images', int(at), image, 'camera', 'jpeg')
@@ -107,7 +106,7 @@ def inspected(run: Run, path: Path, **how) -> BagReport:
     return inspect(path, config=InspectionConfig(min_pictures=100), **how)
 
 
-def mirrored(image: Image) -> Image:
+def mirrored(image):
     return image[:, ::-1]
 
 
@@ -142,7 +141,7 @@ def test_the_check_is_in_the_report_and_stops_the_training(sample, tmp_path, cap
     wrong, bag = showing(sample, mirrored), tmp_path / 'wrong'
     report = inspected(wrong, bag)
     text = 'images turn opposite to odometry and gyroscope: set `clockwise`'
-    assert any(text in lack for lack in report.lacks) and text in report.as_text()
+    assert text in ' '.join(report.lacks) and text in report.as_text()
     with pytest.raises(DataError, match='set `clockwise`'):
         train([bag], tmp_path / 'model.npz')
     assert not (tmp_path / 'model.npz').exists()
@@ -156,7 +155,7 @@ def test_two_views_side_by_side_are_no_panorama(sample, tmp_path):
     stereo = showing(sample, lambda i: np.concatenate([i[:, 100:400], i[:, 110:410]], axis=1))
     report = inspected(stereo, tmp_path / 'bag')
     assert 'stereo pair: the left half shows the same' in report.facts['images']
-    assert any('do not show all directions' in lack for lack in report.lacks)
+    assert 'do not show all directions' in ' '.join(report.lacks)
     with pytest.raises(CameraError, match='two views side by side'):
         train([tmp_path / 'bag'], tmp_path / 'model.npz')
 
@@ -190,7 +189,7 @@ def test_panoramas_of_less_than_a_turn_are_named_where_a_gyroscope_shows_it(samp
         assert degrees == pytest.approx(shown, abs=15)
 
 
-def held(rate: np.ndarray, rng) -> np.ndarray:
+def held(rate, rng):
     """Rates of which one is held for two seconds, after six that are right."""
     rows = np.arange(len(rate))
     return rate[np.where(rows % 200 < 150, rows, rows - rows % 200 + 150)]
@@ -227,7 +226,7 @@ def test_rates_that_wheels_and_images_contradict_are_left_out(sample, name):
     assert np.abs(kept.omega - of_kept).max() < (0.7 if most else 0.1)
 
 
-def skidding(run: Run, where) -> Run:
+def skidding(run, where):
     """Whose wheels turn by 0.6 rad/s more there."""
     odometry = run.odometry
     twists = odometry.twists + np.outer(where(np.arange(len(odometry.twists))), [0.0, 0.6])
@@ -239,7 +238,7 @@ def skidding(run: Run, where) -> Run:
 def test_wheels_that_skid_now_and_then_do_not_condemn_the_gyroscope(sample, where):
     run, check = checked(skidding(sample, where))
     assert np.array_equal(run.yaw_rate.omega, sample.yaw_rate.omega)
-    assert not any('gyroscope' in text for text in check.corrected)
+    assert 'gyroscope' not in ' '.join(check.corrected)
 
 
 def test_a_gyroscope_of_another_motion_or_epoch_is_left_out(sample):
@@ -260,7 +259,7 @@ def test_clocks_that_differ_are_corrected_or_reported(sample, tmp_path, late_s, 
     report = inspected(late, tmp_path / 'bag')
     assert report.motion.pair(POSE, IMAGES).delay_s == pytest.approx(late_s, abs=0.03)
     assert text in report.as_text()
-    assert any('synchronize' in lack for lack in report.lacks) == (abs(late_s) > 0.5)
+    assert ('synchronize' in ' '.join(report.lacks)) == (abs(late_s) > 0.5)
 
 
 def shifted(stamps_ns, rate):
@@ -333,7 +332,7 @@ def test_images_that_follow_the_turns_are_refused_and_no_delay_is(how):
     # Odometry that repeats commands is followed by the robot, and a gyroscope shows it.
     for gyro in (None, replace(run.gyro, omega=np.gradient(shown, 0.02))):
         check = check_motion(run.odometry, (run.stamps_ns, seen), gyro, commands=True)
-        assert not any('follow' in text for text in check.wrong)
+        assert 'follow' not in ' '.join(check.wrong)
 
 
 @pytest.mark.parametrize(('late_s', 'every'), [(0.45, 1), (-0.3, 1), (0.15, 3)])
@@ -342,7 +341,7 @@ def test_a_delay_or_few_images_are_no_stabilization(late_s, every):
     jitter = np.random.default_rng(0).normal(0.0, 0.02, len(run.stamps_ns))
     stamps_ns = run.stamps_ns + np.round((late_s + jitter) * 1e9).astype(np.int64)
     check = check_motion(run.odometry, (stamps_ns[::every], run.poses[::every, 2]), run.gyro)
-    assert check.wrong == [] and not any('clock' in text for text in check.corrected)
+    assert check.wrong == [] and 'clock' not in ' '.join(check.corrected)
 
 
 def test_a_drive_that_hardly_turns_says_nothing():
@@ -363,8 +362,7 @@ def test_wheels_that_skid_are_worth_a_word():
 
 @pytest.mark.parametrize('name', DRIVES)
 def test_messages_in_bundles_or_at_a_low_rate_do_not_jump(name):
-    twists, start = DRIVES[name]
-    odometry = drive(twists, start=start, yaw_noise=0.2, speed_noise=0.2, seed=1).odometry
+    odometry = drive(*DRIVES[name], yaw_noise=0.2, speed_noise=0.2, seed=1).odometry
     bundled = odometry.stamps_ns // 10**8 * 10**8 + np.arange(len(odometry.stamps_ns))
     slower = (rows(odometry, slice(None, None, every)) for every in (1, 5, 25))
     for each in (*slower, replace(odometry, stamps_ns=bundled)):
@@ -374,9 +372,9 @@ def test_messages_in_bundles_or_at_a_low_rate_do_not_jump(name):
 # The ground truth is one more source.
 
 
-def marked(truth: Trajectory, late_s=0.0, lever=0j, swapped=False, unit=1.0, aside=0.0):
+def marked(truth, late_s=0.0, lever=0j, swapped=False, unit=1.0, aside=0.0):
     """A truth of a marker beside base_link, with other stamps, axes, unit and headings."""
-    places = truth.poses[:, :2] @ [1, 1j] + lever * np.exp(1j * truth.poses[:, 2])
+    places = as_complex(truth.poses) + lever * np.exp(1j * truth.poses[:, 2])
     yaw = truth.poses[:, 2] + aside
     if swapped:
         places, yaw = 1j * places.conj(), np.pi / 2 - yaw
@@ -384,7 +382,7 @@ def marked(truth: Trajectory, late_s=0.0, lever=0j, swapped=False, unit=1.0, asi
     return Trajectory(truth.stamps_ns + round(late_s * 1e9), poses)
 
 
-def with_poses(truth: Trajectory, rows, pose) -> Trajectory:
+def with_poses(truth, rows, pose):
     poses = truth.poses.copy()
     poses[rows] = pose
     return replace(truth, poses=poses)
@@ -413,8 +411,7 @@ TRUTHS = {
 
 
 def with_truth(seed=1, lines=10):
-    twists, start = criss_cross(lines, seed=seed)
-    run = drive(twists, start=start, yaw_noise=0.1, speed_noise=0.1, seed=seed)
+    run = drive(*criss_cross(lines, seed=seed), yaw_noise=0.1, speed_noise=0.1, seed=seed)
     return OdometryTrack.of(run.odometry, SegmentConfig()), Trajectory(run.stamps_ns, run.poses)
 
 
@@ -428,7 +425,7 @@ def test_a_faulty_truth_is_corrected(name):
     inside = truth.covers(mended.poses.stamps_ns)
     right, poses = truth.at(mended.poses.stamps_ns[inside]), mended.poses.poses[inside]
     frame = align(poses[:, :2], right[:, :2])
-    assert np.hypot(*(frame.apply(poses[:, :2]) - right[:, :2]).T).max() < 0.03
+    assert distances(frame.apply(poses[:, :2]), right).max() < 0.03
     assert mended.headings == (name != 'no headings')
     assert np.abs(wrap_angle(frame.apply_yaw(poses[:, 2]) - right[:, 2])).max() < np.deg2rad(10.0)
 
@@ -445,7 +442,7 @@ def test_a_short_drive_has_the_offset_of_the_truth_of_other_drives_if_it_fits():
 
 @pytest.mark.parametrize('name', DRIVES)
 def test_a_right_truth_stays_as_it_is(name):
-    run = drive(DRIVES[name][0], start=DRIVES[name][1], yaw_noise=0.2, speed_noise=0.2, seed=1)
+    run = drive(*DRIVES[name], yaw_noise=0.2, speed_noise=0.2, seed=1)
     track = OdometryTrack.of(run.odometry, SegmentConfig())
     noise = np.random.default_rng(0).normal(0.0, 0.01, run.poses.shape)
     for poses in (run.poses, run.poses + noise):
@@ -478,7 +475,7 @@ def test_a_truth_that_is_started_anew_is_reported():
 def fixes(truth, known=0j):
     """A receiver's points of a truth, with 2 cm of noise, beside true places of base_link."""
     noise = np.random.default_rng(0).normal(0.0, 0.02, (2, len(truth)))
-    places = truth.poses[:, :2] @ [1, 1j] + [1, 1j] @ noise
+    places = as_complex(truth.poses) + [1, 1j] @ noise
     rows = zip(truth.stamps_ns.tolist(), places.tolist(), strict=True)
     return Points.of([(str(at), at, place, 0.02, known) for at, place in rows])
 
@@ -490,7 +487,7 @@ def test_points_of_a_topic_are_compared_in_time(name):
     points, (sentence,) = timed_points(fixes(change(truth)), track)
     assert sentence.startswith('points_topic') and text in sentence
     poses = truth.at(points.stamps_ns)
-    antenna = poses[:, :2] @ [1, 1j] + points.lever * np.exp(1j * poses[:, 2])
+    antenna = as_complex(poses) + points.lever * np.exp(1j * poses[:, 2])
     inside = truth.covers(points.stamps_ns)
     assert np.abs(points.places - antenna)[inside].max() < 0.12
 

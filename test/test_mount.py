@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera beside the axle is learned with the map, and poses are those of base_link."""
 
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres
 from metric_worlds import drive, meander, mixtures, straight
+from numpy.testing import assert_allclose
+from places import aligned_errors, as_complex, distances
 from rosbags.typesys import Stores
 
 from sfa_localization.bags.decoding import typestore
@@ -19,7 +21,7 @@ from sfa_localization.bags.writer import BagWriter, blank
 from sfa_localization.camera.panorama import filled, repeated_pixels
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import ConfigError, DataError
-from sfa_localization.data.geometry import align, wrap_angle
+from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity, Rig
 from sfa_localization.keyframes.closures import Textures
 from sfa_localization.keyframes.hidden import seen_in
@@ -50,16 +52,16 @@ def world(twists, start, cameras, mount=None, aside=0.0, noise_m=0.02):
     mount, parts, starts, poses = mount or Mount(), [], [], []
     for number, camera in enumerate(cameras):
         beside = (start[0], start[1] + number * aside, start[2])
-        run = drive(twists, start=beside, yaw_noise=0.02, seed=number)
+        run = drive(twists, beside, yaw_noise=0.02, seed=number)
         starts.append(sum(map(len, poses)))
         poses.append(camera(run.poses))
-        track = dataclasses.replace(OdometryTrack.of(run.odometry, CONFIG), lever=mount.lever)
+        track = replace(OdometryTrack.of(run.odometry, CONFIG), lever=mount.lever)
         parts.append(cut_track(track, run.stamps_ns, CONFIG))
     poses = np.concatenate(poses)
-    segments = dataclasses.replace(join(parts, starts), mount=mount)
+    segments = replace(join(parts, starts), mount=mount)
     offsets = mixtures(Stack.of(segments), poses, noise_m, count=600)
     yaws = np.repeat(mount.of(len(cameras)).yaw, len(poses) // len(cameras))
-    return dataclasses.replace(segments, offsets=offsets.of_robot(yaws)), poses
+    return replace(segments, offsets=offsets.of_robot(yaws)), poses
 
 
 def learned(twists, start, cameras, mount=None, aside=0.0):
@@ -78,7 +80,7 @@ def test_the_place_of_the_camera_is_learned_with_the_graph(lever):
     assert error < 0.04 and error < 3 * np.hypot(*std) and np.all(std < 0.1)
     assert graph.certificate.certified
     places, truth = (p[graph.stack.images, :2] for p in (graph_poses(graph, len(poses)), poses))
-    assert np.hypot(*(align(places, truth).apply(places) - truth).T).mean() < 0.06
+    assert aligned_errors(places, truth).mean() < 0.06
 
 
 def test_a_drive_that_turns_nowhere_shows_no_place_of_the_camera():
@@ -100,12 +102,12 @@ def test_a_camera_that_was_turned_between_two_drives_is_learned():
 def test_base_and_camera_are_inverse():
     rng = np.random.default_rng(0)
     poses = rng.uniform(-3, 3, (20, 3))
-    rig = dataclasses.replace(RIG, camera_yaw=Quantity(0.4, 0.0))
+    rig = replace(RIG, camera_yaw=Quantity(0.4, 0.0))
     for pose, seen in zip(poses, rig.camera(poses), strict=True):
         back, _ = rig.base(seen, np.zeros((3, 3)), 0j)
-        assert np.hypot(*(back - pose)[:2]) < 1e-9 and abs(wrap_angle(back[2] - pose[2])) < 1e-9
+        assert distances(back, pose) < 1e-9 and abs(wrap_angle(back[2] - pose[2])) < 1e-9
     mount = Mount(LEVER, (0.0, 0.4))
-    np.testing.assert_allclose(mount.base(camera_poses(poses, yaw=0.4), 1), poses)
+    assert_allclose(mount.base(camera_poses(poses, yaw=0.4), 1), poses)
 
 
 @pytest.mark.parametrize('yaw_std', [0.05, 1.5])
@@ -113,14 +115,14 @@ def test_the_covariance_of_the_base_is_that_of_its_samples(yaw_std):
     rng = np.random.default_rng(0)
     pose, stds = np.array([1.0, 2.0, 0.7]), np.array([0.05, 0.1, yaw_std])
     drawn = pose + rng.normal(size=(200_000, 3)) * stds
-    places = drawn[:, 0] + 1j * drawn[:, 1] - LEVER * np.exp(1j * drawn[:, 2])
+    places = as_complex(drawn) - LEVER * np.exp(1j * drawn[:, 2])
     base, covariance = RIG.base(pose, np.diag(stds**2), 0j)
     assert abs(places.mean() - complex(*base[:2])) < 2e-3
     true = np.trace(np.cov(places.real, places.imag))
     assert np.trace(covariance[:2, :2]) == pytest.approx(true, rel=0.25)
     samples = np.column_stack([places.real, places.imag, drawn[:, 2]])
     if yaw_std == 0.05:
-        np.testing.assert_allclose(covariance, np.cov(samples.T), atol=2e-4)
+        assert_allclose(covariance, np.cov(samples.T), atol=2e-4)
 
 
 def test_an_uncertain_lever_matters_where_the_robot_heads_elsewhere_than_in_training():
@@ -139,7 +141,7 @@ def test_what_no_robot_has_is_refused_and_a_record_comes_back_as_it_was():
     ):  # fmt: skip
         with pytest.raises(DataError):
             Rig(**{name: Quantity(*wrong)})
-    rig = dataclasses.replace(RIG, camera_delay=Quantity(0.12, 0.03))
+    rig = replace(RIG, camera_delay=Quantity(0.12, 0.03))
     assert Rig.from_mapping(rig.to_mapping()) == rig
     for wrong in ({'camera_ahead': [1.0]}, {'unknown': [0.0, 0.0]}, {'camera_ahead': 'ab'}):
         with pytest.raises(DataError):
@@ -204,8 +206,8 @@ def test_images_that_change_in_turns_tell_a_lever_from_wheels_that_slip():
     """Links alone take slip for a lever; a camera that only turns shows that there is none."""
     segments, _ = world(*meander(150.0), [camera_poses])
     for square, std, lever in ((0.13, 0.01, LEVER), (0.0, 0.002, 0j)):
-        mount = dataclasses.replace(Mount(), turning=Quantity(square, std))
-        learned_lever = Graph.of(dataclasses.replace(segments, mount=mount)).mount.lever
+        mount = replace(Mount(), turning=Quantity(square, std))
+        learned_lever = Graph.of(replace(segments, mount=mount)).mount.lever
         assert abs(learned_lever - lever) < 0.06, (square, learned_lever)
 
 

@@ -16,7 +16,7 @@ from sfa_localization.sfa.image_features import slow_features
 from sfa_localization.sfa.network import Architecture, Layer, Network, Node, input_map, resampled
 
 
-def random_network(architecture: Architecture, seed: int = 0) -> Network:
+def random_network(architecture, seed=0):
     """Weights at random: the network's algebra does not care."""
     rng = np.random.default_rng(seed)
     nodes, channels = [], input_map(pictures(architecture.size, 1), architecture).shape[-1]
@@ -31,11 +31,11 @@ def random_network(architecture: Architecture, seed: int = 0) -> Network:
     return Network(architecture, tuple(nodes))
 
 
-def pictures(size: tuple[int, int], count: int, seed: int = 0) -> np.ndarray:
+def pictures(size, count, seed=0):
     return np.random.default_rng(seed).integers(0, 256, (count, *size, 3), np.uint8)
 
 
-def scene(rows: int, columns: int) -> np.ndarray:
+def scene(rows, columns):
     """The same smooth panorama in any size."""
     elevation = (np.arange(rows) + 0.5)[:, None] / rows
     azimuth = 2 * np.pi * (np.arange(columns) + 0.5) / columns

@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of the way of wheels that images show: a loss in turns, and an offset of the speed."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from cylinder_worlds import SMALL_RECIPE, Spheres, run_in, wander
+from places import distances
 
 from sfa_localization.data.geometry import align
 from sfa_localization.data.rig import Quantity, Rig
@@ -23,11 +24,11 @@ from sfa_localization.sfa.network_training import ImageSequence, train_network
 from sfa_localization.training import learn_place
 
 
-def losing(true: Odometry, loss: float, offset: float = 0.0) -> Odometry:
+def losing(true, loss, offset=0.0):
     """Odometry that counts more way in turns than was driven, and less speed."""
     v = loss * np.abs(true.twists[:, 1]) - offset
     twists = true.twists + np.column_stack([v, 0 * v])
-    return dataclasses.replace(true, twists=twists, poses=integrate(true.stamps_ns, twists))
+    return replace(true, twists=twists, poses=integrate(true.stamps_ns, twists))
 
 
 def way(loss, before=None, map_scale=1.0, seconds=300.0, v=0.3, offset=0.0):
@@ -85,7 +86,7 @@ def test_wheels_that_lose_way_in_turns_give_nearly_as_good_a_map():
     true, panorama = wander(400, 2, hz=4.0), SMALL_RECIPE.panorama
     run = run_in(Spheres.about(1), true, panorama)
     network = train_network(SMALL_RECIPE.architecture, [ImageSequence.of(run)])
-    run = dataclasses.replace(run, odometry=losing(true, 0.15))
+    run = replace(run, odometry=losing(true, 0.15))
     trained = learn_place(network, [run], SMALL_RECIPE)
     loss = trained.model.rig.turn_loss
     assert loss.value == pytest.approx(0.15, abs=0.06) and loss.std < Rig().turn_loss.std
@@ -96,4 +97,4 @@ def test_wheels_that_lose_way_in_turns_give_nearly_as_good_a_map():
     placed, center = align(places, truth).apply(places), truth.mean(0)
     # Odometry that loses way does not show the scale.
     placed = center + (placed - center) * (truth - center).std() / (placed - center).std()
-    assert np.hypot(*(placed - truth).T).mean() < 0.02
+    assert distances(placed, truth).mean() < 0.02

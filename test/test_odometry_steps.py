@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 from filter_drives import SECOND, START_NS, FilterDrive, from_rest, started, winding
+from places import as_complex, lengths
 
 from sfa_localization.bags.motion_arrays import to_odometry
 from sfa_localization.data.errors import DataError
@@ -24,6 +25,11 @@ SURE = np.diag([0.0025, 0.0025, 0.0004])
 def test_a_robot_may_stop_within_a_step_but_not_turn_back():
     assert beyond([0.01, 0.0], 0.04, [[1.0, 0.0]]) == pytest.approx(0.0)
     assert beyond([-0.5, 0.0], 0.04, [[1.0, 0.0]]) == pytest.approx(0.5)
+
+
+def slow_drive(**how):
+    """20 s at 0.4 m/s and 25 Hz."""
+    return FilterDrive(twists=winding(20, 25.0, speed=0.4), rate_hz=25, **how)
 
 
 def fused_over(poses, twists, drive, images=True):
@@ -54,7 +60,7 @@ def jumped(poses, at, way_m, turn_rad=0.0):
 def test_odometry_that_jumps_moves_nothing_and_is_told_until_an_image_comes(
     way_m, turn_rad, with_twist
 ):
-    drive = FilterDrive(twists=winding(20, 25.0, speed=0.4), rate_hz=25)
+    drive = slow_drive()
     twists = drive.read.copy()
     if with_twist:
         twists[251] += [way_m * 25, turn_rad * 25]
@@ -70,7 +76,7 @@ def test_speed_that_changes_within_a_message_and_noise_that_is_learned_are_no_ju
     """As of commands that are repeated, at 10 Hz: 0 to 2 m/s, and 0 to 2 rad/s."""
     twists = np.repeat([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0], [2.0, -2.0]], 10, axis=0)
     commanded = FilterDrive(twists=np.tile(twists, (2, 1)), rate_hz=10)
-    noisy = FilterDrive(twists=winding(20, 25.0, speed=0.4), rate_hz=25)
+    noisy = slow_drive()
     noise = np.random.default_rng(0).normal(0.0, 0.03, noisy.reckoned.shape) * [1.0, 1.0, 0.1]
     for drive, poses, since in (
         (commanded, commanded.reckoned, 0),
@@ -173,8 +179,8 @@ IN_TURN = {
 @pytest.mark.parametrize('name', IN_TURN)
 def test_two_publishers_in_turn_are_named_and_not_believed(name):
     chosen, shift, turn = IN_TURN[name]
-    drive = FilterDrive(twists=winding(20, 25.0, speed=0.4), rate_hz=25)
-    z = shift + (drive.reckoned[:, 0] + 1j * drive.reckoned[:, 1]) * np.exp(1j * turn)
+    drive = slow_drive()
+    z = shift + as_complex(drive.reckoned) * np.exp(1j * turn)
     other = np.column_stack([z.real, z.imag, drive.reckoned[:, 2] + turn])
     poses = np.where(chosen(np.arange(len(z)))[:, None], other, drive.reckoned)
     with pytest.raises(DataError, match=r'two publishers on /wheels: .*; stop one, or record each'):
@@ -196,7 +202,7 @@ FAULTS = {
 @pytest.mark.parametrize('name', FAULTS)
 def test_single_faulty_messages_are_left_out_and_counted(name):
     pose, twist, reason = FAULTS[name]
-    drive = FilterDrive(twists=winding(20, 25.0, speed=0.4), rate_hz=25, start=(1.0, 1.0, 0.0))
+    drive = slow_drive(start=(1.0, 1.0, 0.0))
     where = np.arange(len(drive.stamps_ns)) % 40 == 30
     right = drive.reckoned + np.array([1.0, 2.0, 0.0])
     poses = np.where(where[:, None], pose, right)
@@ -213,7 +219,7 @@ def test_single_faulty_messages_are_left_out_and_counted(name):
 
 @pytest.mark.parametrize('share', [1.0, 0.3])
 def test_where_no_pose_is_filled_the_twist_is_used(share):
-    drive = FilterDrive(twists=winding(20, 25.0, speed=0.4), rate_hz=25)
+    drive = slow_drive()
     where = np.random.default_rng(0).random(len(drive.stamps_ns)) < share
     poses, twists = np.where(where[:, None], NAN, drive.reckoned), drive.read
     odometry, said, _ = to_odometry(values_of(drive, poses, twists), '/odom')
@@ -300,5 +306,5 @@ def test_the_estimate_is_where_commands_led_a_camera_delay_ago(noise, delay_s):
     times = START_NS + np.round(np.arange(9.0, 13.0, 0.005) * SECOND).astype(int)
     poses = np.array([fused.at(at).pose for at in times.tolist()])
     # A twist holds from the stamp before: what a message changes is known one period later.
-    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.02
+    assert lengths(np.diff(poses, axis=0)).max() < 0.02
     assert np.abs(np.diff(poses[:, 2])).max() < 0.03

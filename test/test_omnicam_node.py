@@ -3,11 +3,11 @@
 """The omnicam node on real messages: panoramas, demand, bad pictures, live parameters, sources."""
 
 import array
-import dataclasses
 import itertools
 import sys
 from collections import namedtuple
 from contextlib import suppress
+from dataclasses import replace
 from types import SimpleNamespace
 from unittest import mock
 
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import test_video
+from numpy.testing import assert_array_equal
 
 from sfa_localization.camera import watch
 from sfa_localization.camera.calibration_files import calibration_text
@@ -95,7 +96,7 @@ def test_frame_and_quality_of_service_by_parameter(bench, tmp_path):
     assert (panorama.header.stamp.sec, panorama.header.stamp.nanosec) == (12, 34)
     assert panorama.header.frame_id == 'camera' and panorama.encoding == 'bgr8'
     assert (panorama.height, panorama.width, panorama.step) == (12, 120, 360)
-    np.testing.assert_array_equal(pixels(panorama), Unwrapper(MIRROR, PANORAMA)(raw_picture()))
+    assert_array_equal(pixels(panorama), Unwrapper(MIRROR, PANORAMA)(raw_picture()))
     bench.end(bench.nodes[0])
     path, turned = tmp_path / 'camera.yaml', (0.0, 0.0, 40.0)
     path.write_text(calibration_text(LensCalibration(mount_rpy=turned)))
@@ -103,8 +104,8 @@ def test_frame_and_quality_of_service_by_parameter(bench, tmp_path):
     node, heard = start(bench, frame_id='mast', **given)
     panorama = answer(bench, heard, message())
     assert panorama.header.frame_id == 'mast'
-    camera = dataclasses.replace(MIRROR, mount_rpy=turned)
-    np.testing.assert_array_equal(pixels(panorama), Unwrapper(camera, PANORAMA)(raw_picture()))
+    camera = replace(MIRROR, mount_rpy=turned)
+    assert_array_equal(pixels(panorama), Unwrapper(camera, PANORAMA)(raw_picture()))
     assert node.get_parameter('qos_overrides./image_raw.subscription.depth').value == 1
 
 
@@ -121,8 +122,8 @@ def test_panoramas_are_leveled_by_an_imu(bench):
         assert bench.publish_until('imu/data', sent, lambda: monitor.received > count)
         return pixels(answer(bench, heard, message()))
 
-    np.testing.assert_array_equal(pixels(answer(bench, heard, message())), plain)
-    np.testing.assert_array_equal(unwrapped(0.1, 0.0, after_s=1), plain)
+    assert_array_equal(pixels(answer(bench, heard, message())), plain)
+    assert_array_equal(unwrapped(0.1, 0.0, after_s=1), plain)
     level, text, _ = node.health()
     assert level == DiagnosticStatus.WARN and '/imu/data near images: panoramas are not' in text
     tilt = np.array([0.1, -0.05])
@@ -214,7 +215,7 @@ def test_camera_info_beside_the_images_describes_the_camera(bench, rule, images,
     assert bench.publish_until(infos, camera_info(), lambda: monitor.used)
     assert bench.publish_until(infos, camera_info(focal=90.0), lambda: len(monitor.refused) == 4)
     expected = Unwrapper(CameraConfig(), PANORAMA, FISHEYE)(raw_picture())
-    np.testing.assert_array_equal(pixels(answer(bench, heard, message(), images)), expected)
+    assert_array_equal(pixels(answer(bench, heard, message(), images)), expected)
     assert node.health()[2]['camera model'] == 'fisheye'
 
 
@@ -222,13 +223,13 @@ def test_lens_and_panorama_are_those_of_the_model(bench, trained, tmp_path):
     """Unless the parameters describe a lens; a panorama asked otherwise is refused, and images of
     another shape are.
     """
-    lens = dataclasses.replace(FISHEYE, image_width=640, image_height=640, mount_rpy=(0, 0, 40.0))
-    model, path = dataclasses.replace(PlaceModel.load(trained.model), lens=lens), tmp_path / 'm.npz'
+    lens = replace(FISHEYE, image_width=640, image_height=640, mount_rpy=(0, 0, 40.0))
+    model, path = replace(PlaceModel.load(trained.model), lens=lens), tmp_path / 'm.npz'
     model.save(path)
     node = bench.run(OmnicamNode, model=str(path))
     heard, monitor = bench.listen(Image, 'panorama'), node.monitors['image_raw']
     expected = Unwrapper(CameraConfig(), model.panorama, lens)(raw_picture())
-    np.testing.assert_array_equal(pixels(answer(bench, heard, message())), expected)
+    assert_array_equal(pixels(answer(bench, heard, message())), expected)
     cropped = to_image(raw_picture()[:480], STAMP_NS, 'camera')
     assert bench.publish_until('image_raw', cropped, lambda: monitor.refused)
     assert 'set the camera to the size of the training' in ' '.join(monitor.refused)
@@ -236,7 +237,7 @@ def test_lens_and_panorama_are_those_of_the_model(bench, trained, tmp_path):
     node = bench.run(OmnicamNode, model=str(path), camera_model='mirror')
     heard = bench.listen(Image, 'panorama')
     expected = Unwrapper(MIRROR, model.panorama)(raw_picture())
-    np.testing.assert_array_equal(pixels(answer(bench, heard, message())), expected)
+    assert_array_equal(pixels(answer(bench, heard, message())), expected)
     bench.end(node)
     node = bench.run(OmnicamNode, autostart=False, model=str(path), elevation_min=-20.0)
     with pytest.raises(ConfigError, match=r'elevation_min -20\.0 instead of -12\.0; leave'):
@@ -286,7 +287,7 @@ def test_it_outlives_every_bad_image_and_counts_each(bench):
     answer(bench, heard, message())
     for kinds, bad in enumerate([empty, cropped, message(stamp_ns=0)], 1):
         assert bench.publish_until('image_raw', bad, lambda n=kinds: len(monitor.refused) == n)
-    assert not any('internal' in why for why in monitor.refused)
+    assert 'internal' not in ' '.join(monitor.refused)
     answer(bench, heard, message())
     key = '/image_raw: refused: empty image'
     assert until(lambda: key in {pair.key for pair in told[-1].status[0].values})
@@ -304,9 +305,9 @@ def test_masks_elevation_and_mount_change_while_running_and_are_declared(bench):
     answer(bench, heard, message())
     turned = {'blind_sectors': [170.0, 190.0], 'mount_rpy': [0.0, 0.0, 30.0]}
     assert changed(node, elevation_max=10.0, **turned).successful
-    lower = dataclasses.replace(PANORAMA, elevation_max=10.0)
+    lower = replace(PANORAMA, elevation_max=10.0)
     assert until(lambda: read_info(declared[-1]) == lower)
-    camera = dataclasses.replace(MIRROR, **{k: tuple(v) for k, v in turned.items()})
+    camera = replace(MIRROR, **{k: tuple(v) for k, v in turned.items()})
     expected = Unwrapper(camera, lower)(raw_picture())
     assert until(lambda: np.array_equal(pixels(answer(bench, heard, message())), expected))
 
@@ -319,7 +320,7 @@ def test_panoramas_of_the_camera_are_mounted_and_masked(bench):
     strip = raw_picture()[:120]
     panorama = answer(bench, heard, to_image(strip, STAMP_NS, 'camera'))
     expected = Unwrapper(camera, PANORAMA)(strip)
-    np.testing.assert_array_equal(pixels(panorama), expected)
+    assert_array_equal(pixels(panorama), expected)
     assert not np.array_equal(expected, Unwrapper(CameraConfig(), PANORAMA)(strip))
 
 
@@ -394,7 +395,7 @@ def test_a_folder_of_pictures_in_order_of_their_names(bench, tmp_path):
     assert until(lambda: len(heard) >= 3)
     unwrap = Unwrapper(MIRROR, PANORAMA)
     for number, told in enumerate(heard[:3]):
-        np.testing.assert_array_equal(pixels(told), unwrap(raw_picture(number)))
+        assert_array_equal(pixels(told), unwrap(raw_picture(number)))
         assert told.header.frame_id == 'omnicam'
     stamps = [read_stamp(told.header.stamp) for told in heard]
     assert stamps == sorted(stamps) and stamps[0] > 10**18

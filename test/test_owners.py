@@ -3,11 +3,10 @@
 """One owner for each quantity and rule: the table of CONTRIBUTING.md is true; twins fail."""
 
 import re
-from pathlib import Path
 
 import pytest
+from page_tables import ROOT
 
-ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'sfa_localization'
 SOURCES = {
     path.relative_to(PACKAGE).as_posix(): path.read_text('utf-8') for path in PACKAGE.rglob('*.py')

@@ -13,6 +13,7 @@ from unittest import mock
 
 import pytest
 import setuptools
+from page_tables import ROOT
 
 import sfa_localization
 from sfa_localization import cli
@@ -20,7 +21,6 @@ from sfa_localization.cli import COMMANDS, EXECUTABLES
 from sfa_localization.nodes.process import NODES
 
 NAME = 'sfa_localization'
-ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / NAME
 MODULES = {
     '.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__'): path
@@ -82,7 +82,7 @@ UNSAFE = {'pickle', 'marshal', 'shelve', 'dill', 'joblib'}
 
 
 @cache
-def imports(module: str) -> frozenset[str]:
+def imports(module):
     """Return the full names a module imports, anywhere in it, but not for type checkers only."""
     names: set[str] = set()
     skipped: set[ast.AST] = set()
@@ -98,11 +98,11 @@ def imports(module: str) -> frozenset[str]:
 
 
 @cache
-def tree(module: str) -> ast.AST:
+def tree(module):
     return ast.parse(MODULES[module].read_text(encoding='utf-8'))
 
 
-def internal(module: str) -> set[str]:
+def internal(module):
     """Return the modules of this package that a module imports."""
     return {
         max((m for m in MODULES if f'{name}.'.startswith(f'{m}.')), key=len)
@@ -111,12 +111,12 @@ def internal(module: str) -> set[str]:
     }
 
 
-def external(module: str) -> set[str]:
+def external(module):
     """Return the top-level packages, neither this nor standard, that a module imports."""
     return {name.split('.')[0] for name in imports(module)} - {NAME} - set(sys.stdlib_module_names)
 
 
-def reached(start: str) -> set[str]:
+def reached(start):
     """Return the modules of this package that importing `start` brings in, itself included."""
     seen, todo = set(), {start}
     while todo:
@@ -126,12 +126,12 @@ def reached(start: str) -> set[str]:
     return seen
 
 
-def room(module: str) -> str:
+def room(module):
     """Return the room of a module: its folder, or itself where it lies beside the rooms."""
     return module.split('.')[1] if '.' in module else '__init__'
 
 
-def wrong_imports(module: str) -> set[str]:
+def wrong_imports(module):
     """Return the modules and packages that a module imports, but its room may not."""
     here, (rooms, packages) = room(module), ROOMS[room(module)]
     wrong = {
@@ -199,7 +199,7 @@ def test_versions_agree():
 
 
 @cache
-def setup_arguments(command: str = 'bdist_wheel') -> dict:
+def setup_arguments(command='bdist_wheel'):
     """Return the arguments of setuptools.setup when setup.py runs a command."""
     arguments: dict = {}
     with pytest.MonkeyPatch.context() as patch:

@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 import pytest
 from cylinder_worlds import SMALL_RECIPE
+from numpy.testing import assert_allclose
+from places import lengths
 from test_inspection import write as write_drive
 
 from sfa_localization.bags.drives import images_at
@@ -60,7 +62,7 @@ def test_the_page_of_a_training_answers_its_four_questions(reported):
     assert ('Proven: ' in content.text) == result.model.quality['certified']
     errors = [image.error_m for image in worst]
     assert errors == sorted(errors, reverse=True) and len(errors) <= 6
-    assert errors[0] == pytest.approx(np.hypot(*result.metric.residuals.T).max())
+    assert errors[0] == pytest.approx(lengths(result.metric.residuals).max())
     for image, other in itertools.combinations(worst, 2):
         assert np.hypot(image.x_m - other.x_m, image.y_m - other.y_m) >= 1.0
 
@@ -172,9 +174,9 @@ def test_errors_by_hand():
     """3-4-5 triangles. Headings wrap; unknown ones, and those before the truth, are left out."""
     estimate = path([4, 6, 7], [[9, 9, 9], [1 + 3, 4, np.radians(190)], [2, -5, np.nan]])
     errors = evaluation.errors_of(TRUTH, estimate)
-    np.testing.assert_allclose(errors.seconds, [1, 2])
-    np.testing.assert_allclose(errors.position_m, [5, 5])
-    np.testing.assert_allclose(errors.heading_deg, [-170, np.nan])
+    assert_allclose(errors.seconds, [1, 2])
+    assert_allclose(errors.position_m, [5, 5])
+    assert_allclose(errors.heading_deg, [-170, np.nan])
 
 
 def test_figures_show_paths_to_scale_and_tables_what_could_not_be_judged(tmp_path):

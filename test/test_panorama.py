@@ -4,11 +4,12 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from rosbags.typesys import Stores
 from test_cameras import CAMERAS
 
@@ -68,9 +69,9 @@ def psnr(a, b):
 def test_panorama_conventions():
     rays = panorama_rays(PanoramaConfig(width=360, height=36, elevation_min=-18, elevation_max=18))
     azimuth = np.degrees(np.arctan2(rays[0, :, 1], rays[0, :, 0]))
-    np.testing.assert_allclose(azimuth[[0, 90, 179, 180]], [179.5, 89.5, 0.5, -0.5])
+    assert_allclose(azimuth[[0, 90, 179, 180]], [179.5, 89.5, 0.5, -0.5])
     elevation = np.degrees(np.arcsin(rays[:, 0, 2]))
-    np.testing.assert_allclose(elevation[[0, 17, 35]], [17.5, 0.5, -17.5])
+    assert_allclose(elevation[[0, 17, 35]], [17.5, 0.5, -17.5])
     with pytest.raises(ConfigError, match='elevation_min'):
         PanoramaConfig(elevation_min=10.0, elevation_max=10.0)
     assert looks_like_panorama(100, 350) and not looks_like_panorama(100, 349)
@@ -80,7 +81,7 @@ def test_panorama_conventions():
                                   'polar', 'equirectangular', 'dual fisheye'])  # fmt: skip
 def test_every_camera_gives_the_same_panorama(name):
     """However it is mounted: its turn is a shift of columns, upright edges and horizon straight."""
-    panorama, mount = dataclasses.replace(SMALL, clockwise=name != 'polar'), (-3.0, 2.0, 37.0)
+    panorama, mount = replace(SMALL, clockwise=name != 'polar'), (-3.0, 2.0, 37.0)
     unwrapper = Unwrapper(CameraConfig(mount_rpy=mount), panorama, CAMERAS[name])
     result = unwrapper(picture_of(smooth, CAMERAS[name], mount_rpy=mount))
     seen = unwrapper.visible(SIZE)
@@ -94,9 +95,9 @@ def test_a_panorama_is_only_resized_turned_and_reversed_to_the_convention():
     """With camera_model: panorama, and with any other camera, of which it is no picture."""
     picture = direct(smooth, PanoramaConfig(width=360, height=48)).astype(np.uint8)
     declared = CameraConfig(camera_model='panorama')
-    turned = dataclasses.replace(declared, mount_rpy=(0.0, 0.0, 90.0))
+    turned = replace(declared, mount_rpy=(0.0, 0.0, 90.0))
     big = PanoramaConfig(width=720, height=96)
-    other = dataclasses.replace(SMALL, clockwise=False)
+    other = replace(SMALL, clockwise=False)
     for config, panorama in (
         (declared, SMALL), (mirror(mount_rpy=turned.mount_rpy), SMALL), (declared, big),
         (declared, other),
@@ -108,10 +109,10 @@ def test_a_panorama_is_only_resized_turned_and_reversed_to_the_convention():
         result = Unwrapper(config, SMALL)(same)
         assert np.array_equal(result, same) and not np.shares_memory(result, same)
     plain = Unwrapper(declared, SMALL)(picture)
-    np.testing.assert_array_equal(Unwrapper(turned, SMALL)(picture), np.roll(plain, -45, axis=1))
+    assert_array_equal(Unwrapper(turned, SMALL)(picture), np.roll(plain, -45, axis=1))
     mirrored = LensCalibration(camera_model='panorama', mirrored='yes')
     result = Unwrapper(CameraConfig(), SMALL, mirrored)(picture)
-    np.testing.assert_array_equal(result, plain[:, ::-1])
+    assert_array_equal(result, plain[:, ::-1])
 
 
 def test_a_tilted_panorama_is_levelled():
@@ -129,11 +130,11 @@ def test_a_blind_sector_hides_what_lies_from_its_start_to_its_end_and_repeats_it
         ((30.5, 30.5), AZIMUTH > 400), ((100.0, 140.0), np.abs(AZIMUTH - 120) < 20),
     ):  # fmt: skip
         seen = Unwrapper(mirror(blind_sectors=sector), SMALL).visible(SIZE)
-        np.testing.assert_array_equal(~seen.all(axis=0), hidden)
+        assert_array_equal(~seen.all(axis=0), hidden)
     config = mirror(blind_sectors=(170.0, 190.0))  # behind, so the outer columns
     result, full = (Unwrapper(c, SMALL)(picture_of(smooth)) for c in (config, mirror()))
     columns = np.arange(180).clip(5, 174)
-    np.testing.assert_array_equal(result, full[:, columns])
+    assert_array_equal(result, full[:, columns])
 
 
 def test_a_mask_picture_of_any_size_hides_what_is_black_of_images_of_any_size(tmp_path):
@@ -145,7 +146,7 @@ def test_a_mask_picture_of_any_size_hides_what_is_black_of_images_of_any_size(tm
         seen = unwrapper.visible(size)
         assert not seen[:, 46:134].any()
         assert seen[:, :44].all() and seen[:, 136:].all()
-        np.testing.assert_array_equal(unwrapper.seen(size), seen)
+        assert_array_equal(unwrapper.seen(size), seen)
         result = unwrapper(picture_of(smooth, size=size))
         assert psnr(result[seen], direct(smooth, SMALL)[seen]) > 35
 
@@ -162,7 +163,7 @@ def test_what_the_camera_does_not_see_is_filled_from_what_it_sees():
     result, seen = unwrapper(picture_of(smooth)), unwrapper.visible(SIZE)
     first = int(np.argmax(seen.all(axis=1)))
     assert first > 5 and not seen[: first - 1].any()
-    np.testing.assert_array_equal(result[0], result[int(np.argmax(seen.any(axis=1)))])
+    assert_array_equal(result[0], result[int(np.argmax(seen.any(axis=1)))])
 
 
 def test_wrong_masks_and_pictures_are_refused():
@@ -185,7 +186,7 @@ def test_wrong_masks_and_pictures_are_refused():
 @pytest.mark.parametrize('model', ['', 'panorama'])
 def test_a_panorama_that_the_camera_gives_is_mounted_and_masked(model, clockwise, tmp_path):
     """In any size. Its columns grow as declared; with camera_model: panorama clockwise."""
-    panorama, mount = dataclasses.replace(SMALL, clockwise=clockwise), (4.0, -3.0, 40.0)
+    panorama, mount = replace(SMALL, clockwise=clockwise), (4.0, -3.0, 40.0)
     lens = LensCalibration(camera_model='panorama')
     order = slice(None, None, 1 if clockwise or model else -1)
     cv2.imwrite(str(tmp_path / 'mask.png'), np.full((10, 6), [[0, *[255] * 5]], np.uint8)[:, order])
@@ -205,11 +206,11 @@ def test_a_panorama_that_the_camera_gives_is_mounted_and_masked(model, clockwise
             unwrapper = Unwrapper(CameraConfig(camera_model=model, **hiding), panorama)
             result = unwrapper(level)
             seen = np.broadcast_to(~hidden[:: 1 if clockwise else -1], (24, 180))
-            np.testing.assert_array_equal(unwrapper.visible(size), seen)
+            assert_array_equal(unwrapper.visible(size), seen)
             assert np.abs(result[seen] - direct(smooth, panorama)[seen]).max() < 4
             # A model masks again: nothing changes.
             again = filled(result[None], repeated_pixels(unwrapper.seen(size)))
-            np.testing.assert_array_equal(again[0], result)
+            assert_array_equal(again[0], result)
     untouched = Unwrapper(CameraConfig(camera_model=model), panorama)
     assert untouched.seen(size) is None
     assert not any(untouched.lens.mount_rpy) if model else untouched.lens is None
@@ -223,7 +224,7 @@ def test_recorded_panoramas_are_mounted_and_masked_in_their_size(tmp_path):
     camera = CameraConfig(mount_rpy=(0.0, 0.0, 90.0), blind_sectors=(100.0, 140.0))
     for name, expected in (
         ('plain', Unwrapper(camera, panorama)(picture)),
-        ('made', Unwrapper(dataclasses.replace(camera, mount_rpy=(0.0,) * 3), panorama)(picture)),
+        ('made', Unwrapper(replace(camera, mount_rpy=(0.0,) * 3), panorama)(picture)),
     ):
         with BagWriter(tmp_path / name) as bag:
             for at in (10**18, 10**18 + 10**8):
@@ -233,7 +234,7 @@ def test_recorded_panoramas_are_mounted_and_masked_in_their_size(tmp_path):
             if name == 'made':
                 bag.message('/front/panorama/info', 10**18, info)
         run = read_drive(tmp_path / name, tmp_path, ReadingRecipe(camera=camera))
-        np.testing.assert_array_equal(run.panoramas.read(0, 1)[0], expected)
+        assert_array_equal(run.panoramas.read(0, 1)[0], expected)
         assert 40 <= (~run.seen[0]).sum() <= 41 and (run.seen == run.seen[0]).all()
         missing = ReadingRecipe(camera=CameraConfig(mask_file='nowhere.png'))
         lens = Unwrapper(camera, panorama).lens

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from metric_worlds import criss_cross, drive, exact_features
+from places import as_complex
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.mapping.basis import monomials
 from sfa_localization.mapping.map_fit import MetricProblem
 from sfa_localization.mapping.paper_solver import Lines, descend, learn, odometry_start
 from sfa_localization.mapping.settings import MetricConfig
-from sfa_localization.metric.segments import cut
 from sfa_localization.metric.stack import Stack
 from sfa_localization.motion.settings import SegmentConfig
 
@@ -22,7 +22,7 @@ def problem():
     rng, line = np.random.default_rng(0), np.repeat(np.arange(4), 6)
     turns = np.array([0.5, np.nan, -1.2])
     lines = Lines(rng.standard_normal((24, 6)), rng.uniform(0, 8, 24), line, turns)
-    places = rng.standard_normal((10, 2)) @ [1, 1j]
+    places = as_complex(rng.standard_normal((10, 2)))
     return lines, np.concatenate([rng.uniform(0, 6, 4), places])
 
 
@@ -62,9 +62,8 @@ def test_a_diverging_descent_names_the_other_solver():
 
 
 def lines_of_a_drive():
-    twists, start = criss_cross(10)
-    run = drive(twists, start=start)
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig(segments='straight'))
+    run = drive(*criss_cross(10))
+    segments = run.segments(SegmentConfig(segments='straight'))
     return run, Stack.of(segments), segments
 
 

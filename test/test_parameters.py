@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 import yaml
 from filter_drives import NOISY, FilterDrive, seconds_of
+from page_tables import ROOT
 
 from sfa_localization.camera.calibration_files import read_calibration
 from sfa_localization.cli import main
@@ -34,7 +35,7 @@ from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.nodes.settings import EkfNodeConfig
 
-SHIPPED = Path(__file__).parents[1] / 'config' / 'localization.yaml'
+SHIPPED = ROOT / 'config' / 'localization.yaml'
 
 
 def believed(settings):

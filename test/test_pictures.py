@@ -9,6 +9,7 @@ import array
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from sfa_localization.camera.encodings import (
     ENCODINGS,
@@ -53,10 +54,10 @@ def test_packed_and_planar_yuv():
         for level, u, v, expected in ((126, 128, 128, (128, 128, 128)), (81, 90, 240, (0, 0, 254))):
             data = bytes([{'Y': level, 'U': u, 'V': v}[name] for name in order] * 2)
             image = decode_image(data, 1, 4, 8, encoding)
-            np.testing.assert_allclose(image, np.full((1, 4, 3), expected), atol=2)
+            assert_allclose(image, np.full((1, 4, 3), expected), atol=2)
     for encoding, chroma in {'nv12': (90, 240), 'nv21': (240, 90)}.items():
         image = decode_image(bytes([81] * 8 + list(chroma) * 2), 2, 4, 4, encoding)
-        np.testing.assert_allclose(image, np.full((2, 4, 3), (0, 0, 254)), atol=2)
+        assert_allclose(image, np.full((2, 4, 3), (0, 0, 254)), atol=2)
 
 
 @pytest.mark.parametrize('bits', [10, 12, 14, 16])
@@ -69,11 +70,11 @@ def test_of_16_bits_those_count_that_the_sensor_has(bits):
     swapped = decode_image(words.byteswap().tobytes(), 6, 8, 48, 'bgr16', True)
     packed = decode_compressed(encode_png(words), 'bgr16; png compressed bgr16')
     for image in (color, swapped, packed):
-        np.testing.assert_array_equal(image, picture)
+        assert_array_equal(image, picture)
     gray = np.repeat(picture[..., :1], 3, 2)
     mono = np.ascontiguousarray(words[..., 0])
-    np.testing.assert_array_equal(decode_image(mono.tobytes(), 6, 8, 16, 'mono16'), gray)
-    np.testing.assert_array_equal(decode_compressed(encode_png(mono), 'mono16; png'), gray)
+    assert_array_equal(decode_image(mono.tobytes(), 6, 8, 16, 'mono16'), gray)
+    assert_array_equal(decode_compressed(encode_png(mono), 'mono16; png'), gray)
     assert decode_image((mono // mono.max() * 40).tobytes(), 6, 8, 16, 'mono16').max() <= 10
 
 
@@ -86,7 +87,7 @@ def test_bayer_patterns(depth):
             if depth == 16:
                 mosaic = np.stack([np.zeros_like(mosaic), mosaic], -1)
             image = decode_image(mosaic.tobytes(), 8, 8, depth, f'bayer_{pattern}{depth}')
-            np.testing.assert_array_equal(image[2:6, 2:6], np.broadcast_to(color, (4, 4, 3)))
+            assert_array_equal(image[2:6, 2:6], np.broadcast_to(color, (4, 4, 3)))
 
 
 def test_wrong_pictures_are_refused_with_the_reason():
@@ -100,7 +101,7 @@ def test_wrong_pictures_are_refused_with_the_reason():
     ):  # fmt: skip
         with pytest.raises(CameraError, match=reason):
             decode_image(**{**good, **change})
-    np.testing.assert_array_equal(decode_image(**{**good, 'step': 0}), decode_image(**good))
+    assert_array_equal(decode_image(**{**good, 'step': 0}), decode_image(**good))
 
 
 def test_no_encoding_dies_of_a_tiny_or_odd_picture():

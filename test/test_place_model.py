@@ -5,11 +5,11 @@
 import json
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from cylinder_worlds import place, visit
+from places import lengths
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from sfa_localization import evaluation, training, updating
@@ -27,17 +27,17 @@ from sfa_localization.place_model import FORMAT, VERSION, PlaceModel, camera_of
 
 
 @pytest.fixture(scope='module')
-def model() -> PlaceModel:
+def model():
     return place(True).model
 
 
 @pytest.fixture(scope='module')
-def pictures() -> np.ndarray:
+def pictures():
     return visit().panoramas.read(0, 43)
 
 
 @pytest.fixture
-def saved(model, tmp_path) -> Path:
+def saved(model, tmp_path):
     model.save(tmp_path / 'model.npz')
     return tmp_path / 'model.npz'
 
@@ -73,7 +73,7 @@ def test_images_are_located(clockwise):
     truth, images = visit(clockwise).odometry.poses, visit(clockwise).panoramas.read(0, 43)
     estimates = place(clockwise).model.locate_all(images)
     error = np.array([e.pose for e in estimates]) - truth
-    assert np.median(np.hypot(*error[:, :2].T)) < 0.3
+    assert np.median(lengths(error)) < 0.3
     assert np.degrees(np.median(np.abs(wrap_angle(error[:, 2])))) < 3
     for image, together in zip(images[::9], estimates[::9], strict=True):
         alone = place(clockwise).model.locate(image)
@@ -186,14 +186,14 @@ def test_a_damaged_model_is_refused_with_the_remedy(saved):
     refused(saved, 'not a sfa_localization place model')
 
 
-def rewrite(path: Path, without: str = '', **header) -> None:
+def rewrite(path, without='', **header):
     """Change the header of a saved model, or leave an array out."""
     arrays = read_arrays(path, FORMAT, VERSION, '')
     arrays['header'] = np.array(json.dumps({**json.loads(str(arrays['header'])), **header}))
     write_arrays(path, {name: array for name, array in arrays.items() if name != without})
 
 
-def refused(path: Path, told: str) -> None:
+def refused(path, told):
     with pytest.raises(ModelError, match=told) as error:
         PlaceModel.load(path)
     assert str(path) in str(error.value)

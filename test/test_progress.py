@@ -5,14 +5,12 @@
 import io
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from page_tables import ROOT
 
 from sfa_localization import cli
 from sfa_localization.data import progress
-
-ROOT = Path(__file__).parents[1]
 
 
 def test_a_log_gets_a_line_each_ten_seconds(monkeypatch, capsys):

@@ -21,20 +21,20 @@ FIELDS = (
 BROKEN = np.array([True, False, True, False, True])
 
 
-def maps(seed: int, count: int, rows: int = 5, columns: int = 12, channels: int = 3) -> np.ndarray:
+def maps(seed, count, rows=5, columns=12, channels=3):
     """Maps with a mean, changing slowly from picture to picture."""
     rng = np.random.default_rng(seed)
     drift = rng.normal(size=(count, rows, columns, channels)).cumsum(0)
     return (0.5 + drift).astype(np.float32)
 
 
-def sequence(of: np.ndarray) -> np.ndarray:
+def sequence(of):
     """The training sequence: map 0 at all rotations, then map 1, ...; (T * R, ...)."""
     turns = range(of.shape[2])
     return np.concatenate([[np.roll(m, -turn, axis=1) for turn in turns] for m in of])
 
 
-def views(of: np.ndarray, field: Field) -> np.ndarray:
+def views(of, field):
     """What each node sees, cut out pixel by pixel in float64: (T, rows_out, R, D)."""
     t, rows, columns, _ = of.shape
     seen = []
@@ -46,7 +46,7 @@ def views(of: np.ndarray, field: Field) -> np.ndarray:
     return np.stack(seen, 1).reshape(t, -1, columns, seen[0].shape[-1])
 
 
-def brute_force(signals: np.ndarray, rotations: int, joined: np.ndarray) -> Statistics:
+def brute_force(signals, rotations, joined):
     """Sums over nodes of an explicit sequence (T * R, rows, nodes, D), divided by R."""
     d = signals.shape[-1]
     per_node = signals.reshape(len(signals), -1, d)
@@ -59,7 +59,7 @@ def brute_force(signals: np.ndarray, rotations: int, joined: np.ndarray) -> Stat
     return Statistics(*(each / rotations for each in sums))
 
 
-def assert_equal(ours: Statistics, theirs: Statistics, tolerance: float = 1e-5) -> None:
+def assert_equal(ours, theirs, tolerance=1e-5):
     for name in ('weight', 'steps', 'total', 'second', 'difference'):
         a, b = getattr(ours, name), getattr(theirs, name)
         assert np.abs(a - b).max() <= tolerance * np.abs(b).max(), name
@@ -122,18 +122,18 @@ def test_batches_and_merged_parts_equal_the_whole(batch, broken, seed):
 PERIODS = (400.0, 130.0, 47.0, 9.0)
 
 
-def sources(count: int = 8000) -> np.ndarray:
+def sources(count=8000):
     """Sinusoids of falling slowness, unit variance, (N, 4)."""
     t = np.arange(count)[:, None]
     return np.sqrt(2) * np.sin(2 * np.pi * t / np.array(PERIODS) + np.arange(4))
 
 
-def mixed(seed: int = 0) -> np.ndarray:
+def mixed(seed=0):
     rng = np.random.default_rng(seed)
     return sources() @ rng.normal(size=(4, 4)) + rng.normal(size=4)
 
 
-def fitted(x: np.ndarray, outputs: int, relative_cut: float = 1e-7):
+def fitted(x, outputs, relative_cut=1e-7):
     """The solution for a signal (N, D)."""
     dx = np.diff(x, axis=0)
     sums = Statistics(len(x), x.sum(0, dtype=np.float64), x.T @ x, len(dx), dx.T @ dx)

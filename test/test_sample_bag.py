@@ -3,15 +3,15 @@
 """The bags that come with the project are what their README says."""
 
 import re
-from pathlib import Path
 
 import pytest
+from page_tables import ROOT
 
 from sfa_localization.bags.drives import read_drive
 from sfa_localization.camera.kinds import PANORAMA
 from sfa_localization.inspection import inspect
 
-BAGS = Path(__file__).parents[1] / 'bags'
+BAGS = ROOT / 'bags'
 README = (BAGS / 'README.md').read_text(encoding='utf-8')
 
 

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.nodes.saved_pose import SavedPose, load_pose, save_pose
@@ -25,14 +26,14 @@ def test_what_is_written_is_read_back_and_another_pose_rejected_and_written_over
         save_pose(path, SAVED)
         read = load_pose(path, 'map')
         assert (read.stamp_ns, read.frame) == (7, 'map')
-        np.testing.assert_array_equal(read.pose, SAVED.pose)
-        np.testing.assert_array_equal(read.covariance, SAVED.covariance)
+        assert_array_equal(read.pose, SAVED.pose)
+        assert_array_equal(read.covariance, SAVED.covariance)
         path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
         with pytest.raises(DataError, match=r'pose\.json: cannot be used'):
             load_pose(path, 'map')
     # A robot that was off may have been moved a little.
     stds = np.sqrt(np.diag(read.moved()))
-    np.testing.assert_allclose(stds, np.hypot([0.2, 0.1, 0.05], [0.5, 0.5, 0.3]))
+    assert_allclose(stds, np.hypot([0.2, 0.1, 0.05], [0.5, 0.5, 0.3]))
 
 
 def test_a_file_of_something_else_is_rejected_by_name_and_stays(tmp_path):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from metric_worlds import criss_cross, drive, meander, stand, straight, turn
+from places import as_complex
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import compose, relative, wrap_angle
@@ -36,7 +37,7 @@ def check_segments(segments, poses, tolerance=1e-6):
 
     for segment in segments:
         local = relative(frame(segment), poses[segment.images])
-        assert np.allclose(segment.path, local[:, 0] + 1j * local[:, 1], atol=tolerance)
+        assert np.allclose(segment.path, as_complex(local), atol=tolerance)
         assert np.allclose(wrap_angle(segment.headings - local[:, 2]), 0, atol=tolerance)
     for a, b in zip(segments.items[:-1], segments.items[1:], strict=True):
         step = relative(frame(a), frame(b))
@@ -58,9 +59,8 @@ def test_a_square_gives_its_four_sides():
 
 
 def test_pieces_of_a_curved_drive_follow_the_truth():
-    twists, start = meander(60.0, seed=3)
-    run = drive(twists, start=start)
-    segments = cut(run.odometry, run.stamps_ns, ANY)
+    run = drive(*meander(60.0, seed=3))
+    segments = run.segments(ANY)
     assert all(length_m(s) <= PIECE_LENGTH_M + 1e-6 for s in segments)
     assert segments.images.used == len(run.stamps_ns)
     check_segments(segments, run.poses)
@@ -73,7 +73,7 @@ def test_pieces_of_a_curved_drive_follow_the_truth():
 @pytest.mark.parametrize('config', [ANY, STRAIGHT])
 def test_every_picture_is_used_once_or_counted(config):
     twists, start = criss_cross(6)
-    run = drive(np.vstack([twists, stand(5.0)]), start=start)
+    run = drive(np.vstack([twists, stand(5.0)]), start)
     stamps = np.concatenate([[0], run.stamps_ns, [10**12, 2 * 10**12]])
     segments = cut(run.odometry, stamps, config)
     images = np.concatenate([s.images for s in segments])
@@ -84,7 +84,7 @@ def test_every_picture_is_used_once_or_counted(config):
 
 def test_a_standing_robot_does_not_break_the_line_and_a_pause_of_the_odometry_does():
     run = drive(np.vstack([straight(4.0), stand(4.0), straight(12.0)]))
-    segments = cut(run.odometry, run.stamps_ns, ANY)
+    segments = run.segments(ANY)
     assert segments.images.skipped['standing still'] == pytest.approx(20, abs=2)
     assert sum(length_m(s) for s in segments) > 14.9
     assert all(s.linked for s in segments.items[:-1])
@@ -97,12 +97,12 @@ def test_a_standing_robot_does_not_break_the_line_and_a_pause_of_the_odometry_do
 
 def test_the_gyro_replaces_the_wheels_yaw():
     run, biased = drive(meander(40.0)[0]), drive(meander(40.0)[0], bias=0.02)
-    segments = cut(biased.odometry, biased.stamps_ns, ANY, run.gyro)
+    segments = biased.segments(ANY, run.gyro)
     check_segments(segments, run.poses, tolerance=1e-2)
     wheels = cut(biased.odometry, biased.stamps_ns, replace(ANY, yaw_source='odometry'), run.gyro)
     assert abs(wheels[0].turn_rad - segments[0].turn_rad) > 0.02
     with pytest.raises(DataError, match='imu topic'):
-        cut(run.odometry, run.stamps_ns, replace(ANY, yaw_source='gyro'))
+        run.segments(replace(ANY, yaw_source='gyro'))
 
 
 def test_where_the_gyro_pauses_the_wheels_go_on():
@@ -112,7 +112,7 @@ def test_where_the_gyro_pauses_the_wheels_go_on():
     keep = (seconds < 2.0) | ((seconds > 10.0) & (seconds < 35.0))
     columns = run.gyro.stamps_ns, run.gyro.omega + bias, run.gyro.variance
     gyro = YawRate(*(column[keep] for column in columns))
-    segments = cut(run.odometry, run.stamps_ns, STRAIGHT, gyro)
+    segments = run.segments(STRAIGHT, gyro)
     assert segments.odometry.skipped['in a gap of the gyroscope'] > 0
     turns = [s.turn_rad - bias * s.turn_time_s for s in segments.items[:-1]]
     assert turns == pytest.approx([np.pi / 2] * 7, abs=0.01)
@@ -126,7 +126,7 @@ def test_links_err_as_they_or_the_messages_say(monkeypatch):
         run = drive(straight(30.0), yaw_noise=0.05 * np.sqrt(50), seed=seed)
         squared += [
             (s.turn_rad**2 / s.turn_variance, s.displacement.imag**2 / s.displacement_variance)
-            for s in cut(run.odometry, run.stamps_ns, config)
+            for s in run.segments(config)
             if s.linked
         ]
     assert np.mean(squared, axis=0) == pytest.approx([1.0, 1.0], abs=0.25)
@@ -143,4 +143,4 @@ def test_a_drive_without_segments_says_what_to_do():
     ):
         run = drive(twists)
         with pytest.raises(DataError, match=remedy):
-            cut(run.odometry, run.stamps_ns, config)
+            run.segments(config)

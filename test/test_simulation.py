@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from places import distances, lengths
 
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.leveling import tilted
@@ -129,9 +130,9 @@ def test_drives_start_at_the_dock_keep_clear_and_take_pictures_as_asked(garden):
     assert (np.abs(poses[:, :2]) <= garden.half + 0.02).all()
     solid = np.concatenate([shape.vertices[shape.faces] for shape in garden.shapes])
     solid = solid[((solid[..., 2] < 0.6) & (solid[..., 2] > 0.05)).any(1)].reshape(-1, 3)[:, :2]
-    assert min(np.hypot(*(solid - p[:2]).T).min() for p in poses) > CLEARANCE_M - 0.05
+    assert min(distances(solid, p[:2]).min() for p in poses) > CLEARANCE_M - 0.05
     assert np.allclose(poses[0], garden.dock) and recorded.truth.stamps_ns[0] == START_NS
-    spacing = np.hypot(*np.diff(recorded.image_poses[:, :2], axis=0).T)
+    spacing = lengths(np.diff(recorded.image_poses, axis=0))
     turns = np.abs(wrap_angle(np.diff(recorded.image_poses[:, 2])))
     straight = spacing[(turns < 0.02) & (spacing < 0.5)]
     assert np.all(np.diff(recorded.image_stamps_ns) > 0)
@@ -143,18 +144,18 @@ def test_each_route_is_what_it_promises(garden):
     poses = drive(garden, SimulationConfig(seed=2)).image_poses
     grid = np.stack(np.meshgrid(np.arange(-7, 8), np.arange(-8, 9)), -1).reshape(-1, 2)
     grid = grid[Lawn(garden.half, garden.obstacles).free(grid)]
-    nearest = [np.hypot(*(poses[:, :2] - point).T).min() for point in grid]
+    nearest = [distances(poses, point).min() for point in grid]
     assert max(nearest) < 2.0 and np.mean(nearest) < 0.5
     directions = np.histogram(poses[:, 2] % np.pi, bins=6, range=(0, np.pi))[0]
     assert directions.min() > 0.04 * len(poses) and 1400 < len(poses) < 1900
     poses = drive(garden, SimulationConfig(trajectory='lines', seed=4)).image_poses
-    parts = np.split(poses, np.flatnonzero(np.hypot(*np.diff(poses[:, :2], axis=0).T) > 0.4) + 1)
+    parts = np.split(poses, np.flatnonzero(lengths(np.diff(poses, axis=0)) > 0.4) + 1)
     assert len(parts) == 10
     for part in parts:
-        assert np.hypot(*(part[-1] - part[0])[:2]) > 8.0 - 0.4
+        assert distances(part[-1], part[0]) > 8.0 - 0.4
         assert np.ptp(np.unwrap(part[:, 2])) < 1e-6
     poses = drive(garden, SimulationConfig(trajectory='test', seed=7)).truth.poses
-    assert np.hypot(*(poses[-1] - poses[0])[:2]) < 0.1
+    assert distances(poses[-1], poses[0]) < 0.1
     x, y, turned = np.diff(poses, axis=0).T
     length = np.hypot(x, y)
     moving = length > 0.015
@@ -167,7 +168,7 @@ def test_odometry_drifts_like_the_papers_robot_or_as_drawn_or_not(garden):
 
     def drifts(**settings):
         configs = (SimulationConfig(seed=seed, **settings) for seed in range(4))
-        return [np.hypot(*odometry_errors(garden, c)[:, :2].T).mean() for c in configs]
+        return [lengths(odometry_errors(garden, c)).mean() for c in configs]
 
     assert drifts(trajectory='test') == pytest.approx([0.31] * 4, rel=0.05)
     covering, drawn = drifts(), drifts(trajectory='test', test_drift=0.0)

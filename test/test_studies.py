@@ -10,6 +10,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from places import lengths
 from study import __main__ as studies
 from study import comparisons, light, page, results, sites, year
 from study.comparisons import BASELINES, VARIANTS
@@ -145,7 +146,7 @@ HALF_REAL = SimulationConfig(area=(6.0, 6.0), images_every=0.2, images_every_tur
 def test_a_given_drive_spaces_its_images_along_the_path_and_has_none_where_its_poses_pause():
     truth, odometry = circle()
     driven = given_drive(truth, odometry, HALF_REAL)
-    steps = np.hypot(*np.diff(driven.image_poses[:, :2], axis=0).T)
+    steps = lengths(np.diff(driven.image_poses, axis=0))
     assert steps.min() >= 0.2 and steps.max() < 0.24  # jitter of 0.2 mm adds nothing
     seconds = truth.stamps_ns * 1e-9
     kept = (seconds < 10) | (seconds > 20)

@@ -4,11 +4,10 @@
 
 import ast
 import re
-from pathlib import Path
 
 import pytest
+from page_tables import ROOT
 
-ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'sfa_localization'
 LINTED = [str(ROOT / name) for name in ('sfa_localization', 'test', 'setup.py')]
 # ament_copyright does not know SPDX headers.

@@ -8,13 +8,14 @@ from functools import cache
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres, place, recipe, run_in, visit, wander
+from numpy.testing import assert_allclose
+from places import distances, lengths
 from test_keyframes import HOME, drive, errors, familiar, keyframes_of, unseen
 
 from sfa_localization.camera.leveling import NEAR_NS, tilted, tilts_at
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.keyframes.keyframes import Keyframes
 from sfa_localization.keyframes.leveling import camera_lean, leveled_runs
 from sfa_localization.keyframes.texture import spectrum, texture, turned
 from sfa_localization.keyframes.tilt import find_tilt
@@ -52,14 +53,14 @@ def test_the_tilt_between_two_textures_is_measured(degrees):
     assert np.hypot(*(tilts[0] - tilt)) < 0.7 * 1.2 / 16  # of a row
 
 
-def swayed(images: np.ndarray, degrees: float, seed: int, sphere: Sphere = SPHERE):
+def swayed(images, degrees, seed, sphere=SPHERE):
     """Images (N, H, W, 3) of a robot that is tilted at random by so much, and the tilts (N, 2)."""
     tilts = np.radians(degrees) * np.random.default_rng(seed).normal(size=(len(images), 2))
     return np.stack([tilted(*pair, sphere) for pair in zip(images, tilts, strict=True)]), tilts
 
 
 @cache
-def learnt() -> Keyframes:
+def learnt():
     return keyframes_of([HOME.panoramas(drive(), CONFIG)], [drive()], [0], CONFIG)
 
 
@@ -70,7 +71,7 @@ def test_a_tilted_image_is_located_like_a_level_one():
     off, swung, locations = errors(learnt(), images, unseen(40))
     assert off.mean() < 1.5 * flat.mean() + 0.01
     assert swung.mean() < turns.mean() + np.radians(0.3)
-    rest = np.hypot(*(np.array([location.tilt for location in locations]) - tilts).T)
+    rest = distances(np.array([location.tilt for location in locations]), tilts)
     assert np.degrees(np.median(rest)) < 0.5
     assert all(map(familiar, locations))
 
@@ -89,8 +90,8 @@ def test_drives_are_leveled_before_they_are_learned_from(clockwise):
     counted = []
     (leveled_run,) = leveled_runs([run], panorama.sphere, counted.append)
     assert set(counted) == {1} and np.array_equal(run.panoramas.images, images)
-    rest = np.hypot(*(leveled_run.panoramas.tilts - tilts).T)
-    assert np.median(rest) < 0.25 * np.median(np.hypot(*tilts.T))
+    rest = distances(leveled_run.panoramas.tilts, tilts)
+    assert np.median(rest) < 0.25 * np.median(lengths(tilts))
     batches = np.concatenate(list(leveled_run.panoramas.batches(64)))
     assert np.array_equal(batches, leveled_run.panoramas.read(0, 240)) and len(batches) == 240
 
@@ -127,7 +128,7 @@ def test_a_model_levels_the_images_of_a_camera_that_leans(tmp_path):
     assert np.degrees(np.hypot(*(model.lean - LEAN))) < 1.0
     seen = model.locate_all(leaning(visit()).panoramas.images)
     places = np.array([observation.position for observation in seen])
-    assert np.hypot(*(places - visit().odometry.poses[:, :2]).T).mean() < 0.1
+    assert distances(places, visit().odometry.poses).mean() < 0.1
 
 
 def test_the_orientation_of_an_image_is_that_near_its_stamp():
@@ -136,5 +137,5 @@ def test_the_orientation_of_an_image_is_that_near_its_stamp():
     missing = [np.nan, np.nan]
     expected = [missing, [0.1, 0.1], [0.2, 0.0], [0.2, -0.05], missing]
     of_images = tilts_at(np.array([-2, 0.5, 2, 2.5, 5]) * NEAR_NS, stamps, tilts)
-    np.testing.assert_allclose(of_images, expected, atol=1e-12)
+    assert_allclose(of_images, expected, atol=1e-12)
     assert np.isnan(tilts_at(stamps, stamps[:0], tilts[:0])).all()

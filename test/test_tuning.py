@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 from filter_drives import FilterDrive
+from places import as_complex
 
 from sfa_localization import tuning
 from sfa_localization.data.error_correlation import ErrorCorrelation
@@ -49,7 +50,7 @@ def test_the_likelihood_needs_no_truth_and_is_best_near_the_true_noise():
 
 def test_the_searches_find_the_least_cost_and_stay_in_the_ranges(monkeypatch):
     def cost(_, config):
-        return np.log([config.measurement_factor / 4, config.odometry_factor / 0.5]) @ [1, 1j]
+        return as_complex(np.log([config.measurement_factor / 4, config.odometry_factor / 0.5]))
 
     monkeypatch.setattr(tuning, 'TRIALS', 400)
     monkeypatch.setattr(tuning, 'likelihood_cost', lambda *at: abs(cost(*at)))

@@ -9,15 +9,15 @@ from functools import cache
 import metric_worlds as worlds
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from places import distances
 from scipy.stats import chi2
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.mapping import learning, selection
-from sfa_localization.mapping.learning import MetricResult, learn_turned
+from sfa_localization.mapping.learning import learn_turned
 from sfa_localization.mapping.settings import MetricConfig
 from sfa_localization.mapping.turned_maps import TurnedMaps, turned_back
-from sfa_localization.metric.segments import cut
-from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.sfa.image_features import spectrum
 
 COLUMNS, CHANNELS, ORDERS = 24, 6, 5
@@ -42,7 +42,7 @@ def maps_at(poses, sign=-1.0, noise=0.02, seed=0):
 
 
 @cache
-def world() -> tuple[MetricResult, TurnedMaps, MetricResult]:
+def world():
     """The map of noisy slow features of a drive, and that of its turned maps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(selection, 'INDUCING_POINTS', 150)
@@ -50,7 +50,7 @@ def world() -> tuple[MetricResult, TurnedMaps, MetricResult]:
         twists, start = worlds.criss_cross(12, half=HALF, seed=1, shortest=4.0)
         drive = worlds.drive(twists, yaw_noise=0.01, seed=2)
         assert start[2] == 0.0
-        segments = cut(drive.odometry, drive.stamps_ns, SegmentConfig())
+        segments = drive.segments()
         slow = worlds.garden_features(drive.poses[:, :2], noise=NOISE, seed=3)
         first = learning.learn_metric(slow, segments, CONFIG)
         return first, *learn_turned(spectrum(maps_at(drive.poses)), segments, first, -1.0)
@@ -72,7 +72,7 @@ def located(poses, yaw_error=0.0, yaw_variance=1e-4):
 
 
 def mean_error(places, poses):
-    return float(np.hypot(*(places - poses[:, :2]).T).mean())
+    return float(distances(places, poses).mean())
 
 
 def share_inside(estimate, places):
@@ -89,7 +89,7 @@ def test_features_do_not_depend_on_the_heading_between_columns(sign):
     turned = np.column_stack([poses[:, :2], yaw])
     exact = (spectrum(maps_at(each, sign, noise=0.0)) for each in (poses, turned))
     features = [turned_back(next(exact), each[:, 2], sign) for each in (poses, turned)]
-    np.testing.assert_allclose(*features, atol=2e-5)
+    assert_allclose(*features, atol=2e-5)
     assert np.abs(features[0]).max() > 0.5
 
 
@@ -114,6 +114,6 @@ def test_an_uncertain_heading_widens_the_covariance():
     _, _, added = located(poses, yaw_variance=step**2)
     slope = (located(poses, step)[0] - located(poses, -step)[0]) / 2
     moved = np.einsum('ti,tj->tij', slope, slope)
-    np.testing.assert_allclose(added, moved, atol=0.2 * moved.max())
+    assert_allclose(added, moved, atol=0.2 * moved.max())
     off = located(poses, np.random.default_rng(2).uniform(-np.pi, np.pi, 40), np.pi**2 / 3)
     assert share_inside(off, poses[:, :2]) >= 0.65  # three headings do not show every place

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Turns by odometry and images together: by the noise of both, which the drive shows."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -129,13 +129,13 @@ def test_a_short_pause_is_bridged_and_images_show_the_turn_in_it():
 def test_a_training_turns_by_its_images_where_wheels_slip():
     """Columns grow counterclockwise; up to the segments, and to the robot of the model."""
     panorama = PanoramaConfig(width=120, height=24, clockwise=False)
-    config = dataclasses.replace(recipe(False), panorama=panorama)
+    config = replace(recipe(False), panorama=panorama)
     true = wander(400, 2, hz=4.0)
     run = run_in(Spheres.about(1), true, panorama)
     twists = true.twists * [1.0, 1.2]
     twists[:, 1] += 0.1 * np.random.default_rng(0).standard_normal(len(twists))
     poses = integrate(true.stamps_ns, twists, true.poses[0])
-    bad = dataclasses.replace(run, odometry=dataclasses.replace(true, twists=twists, poses=poses))
+    bad = replace(run, odometry=replace(true, twists=twists, poses=poses))
     drives = TrainingInput.of([bad], config).drives
     segments = drives.cut()
     turned = np.array([s.start[2] - true.poses[s.images[0], 2] for s in segments])

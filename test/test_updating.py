@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres, place, recipe, run_in, wander
+from numpy.testing import assert_allclose, assert_array_equal
 
 from sfa_localization import updating
 from sfa_localization.camera.leveling import tilted
@@ -109,17 +110,17 @@ def test_network_maps_and_first_keyframes_stay_also_in_its_file(tmp_path):
     assert newer.network is model.network and newer.metric is model.metric
     assert newer.turned is model.turned and newer.keyframes.errors == model.keyframes.errors
     first = len(model.keyframes.poses)
-    np.testing.assert_array_equal(newer.keyframes.values[:first], model.keyframes.values)
-    np.testing.assert_array_equal(newer.keyframes.poses[first:], new.poses)
+    assert_array_equal(newer.keyframes.values[:first], model.keyframes.values)
+    assert_array_equal(newer.keyframes.poses[first:], new.poses)
     assert newer.keyframes.first.sum() == first and 'updates' not in model.quality
     newer.save(tmp_path / 'model.npz')
     read = PlaceModel.load(tmp_path / 'model.npz')
-    np.testing.assert_array_equal(read.keyframes.lights, newer.keyframes.lights)
+    assert_array_equal(read.keyframes.lights, newer.keyframes.lights)
     assert read.keyframes.trained == newer.keyframes.trained == 1
     assert read.quality['updates'] == [{'bag': 'later', 'images': len(new)}]
     assert usual_explained(read) == pytest.approx(usual_explained(model))
     image = drive().panoramas.read(30, 31)[0]
-    np.testing.assert_allclose(read.locate(image).position, newer.locate(image).position)
+    assert_allclose(read.locate(image).position, newer.locate(image).position)
 
 
 def test_familiar_images_are_not_new():
@@ -170,7 +171,7 @@ def test_added_keyframes_are_bounded_and_the_old_near_ones_give_way():
     assert len(full.keyframes.poses) == first + updating.MOST_ADDED
     newer = added(full, 100, 101.0)
     x = newer.keyframes.poses[first:, 0]
-    np.testing.assert_array_equal(newer.keyframes.poses[:first], model.keyframes.poses[:first])
+    assert_array_equal(newer.keyframes.poses[:first], model.keyframes.poses[:first])
     assert len(x) == updating.MOST_ADDED
     assert np.count_nonzero(x >= 200.0) == 500, 'the newer half stays'
     assert np.count_nonzero(x < 101.0) == 100, 'of the oldest 200 those far from new ones stay'

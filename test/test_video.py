@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from sfa_localization.bags.drives import ReadingRecipe, images_at, read_drive
 from sfa_localization.bags.reader import Bag
@@ -163,7 +164,7 @@ def test_bags_of_each_type_are_read_and_reported(tmp_path, kind, monkeypatch):
     (report,) = (topic for topic in inspect(path).topics if topic.name == KINDS[kind])
     assert report.problems == [f'5 of 21 messages: {video.TOO_EARLY}']
     (alone,) = images_at(path, [START + 13 * STEP], ReadingRecipe()).values()
-    np.testing.assert_array_equal(alone, read[13])
+    assert_array_equal(alone, read[13])
     monkeypatch.setitem(sys.modules, 'av', None)
     with pytest.raises(BagError, match=r'21 h264 video needs PyAV: pip install av'):
         read_drive(path, tmp_path)

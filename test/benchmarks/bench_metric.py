@@ -54,7 +54,7 @@ class Problem:
         run = drive(twists, start=start, seed=seed, **NOISE)
         cutter = SegmentConfig(segments='any' if kind == 'pieces' else 'straight')
         segments = cut(run.odometry, run.stamps_ns, cutter)
-        features = garden_features(run.poses[:, :2], noise=0.05, count=8, seed=seed, world=seed)
+        features = garden_features(run.poses, noise=0.05, count=8, seed=seed, world=seed)
         return cls(run, segments, features)
 
 

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from page_tables import markdown
+from places import distances
 
 from sfa_localization.bags.reader import Bag
 from sfa_localization.data.geometry import align
@@ -86,7 +86,7 @@ def _judge(out: Path, config: StudyConfig, area: tuple[float, float], every: flo
         'images': len(trained.runs[0].panoramas),
         'training_s': round(seconds),
         'memory_gb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
-        'labels': float(np.hypot(*(frame.apply(places) - truth).T).mean()),
+        'labels': float(distances(frame.apply(places), truth).mean()),
         'localised': states.get('LOCALISED', 0.0) / sum(states.values()),
         **scores_of(judged),
     }

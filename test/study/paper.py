@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from places import as_complex
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
@@ -163,7 +164,7 @@ def random_parameters(lines: int, terms: int, size: Array, seed: int) -> Complex
     rng = np.random.default_rng(seed)
     alpha, weights = rng.uniform(0, 2 * np.pi, lines), rng.uniform(-1, 1, (terms, 2))
     origins = rng.uniform(-size / 2, size / 2, (lines, 2))
-    return np.concatenate([alpha, origins @ [1, 1j], weights @ [1, 1j]])
+    return np.concatenate([alpha, as_complex(origins), as_complex(weights)])
 
 
 def _nearest_frame(places: Array, truth: Array) -> tuple[float, RigidTransform]:

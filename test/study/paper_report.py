@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from page_tables import markdown
+from places import distances
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.reports.evaluation import MARGIN_M, TRUTH
@@ -160,7 +161,7 @@ def panels_figure(path: Path, rows: Mapping[str, Sequence[Panel]]) -> None:
 
 
 def _draw(axes: Axes, panel: Panel) -> None:
-    error = np.nanmean(np.hypot(*(panel.estimate - panel.truth).T))
+    error = np.nanmean(distances(panel.estimate, panel.truth))
     axes.set_title(f'{panel.title}: {error:.3f} m' if panel.aligned else panel.title)
     away = 0.0 if panel.aligned else np.nanmean(panel.truth - panel.estimate, axis=0)
     estimate = panel.estimate + away

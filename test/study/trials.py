@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
+from places import distances
 
 from sfa_localization.bags.drives import read_drive
 from sfa_localization.data.error_correlation import ErrorCorrelation
@@ -261,4 +262,4 @@ def mean_distance(path: Trajectory, truth: Trajectory) -> float:
 
 def mean_error(places: Array, truth: Array) -> float:
     """Mean distance (m) of places (N, 2) from true ones (N, 2), without NaN."""
-    return float(np.nanmean(np.hypot(*(places - truth).T)))
+    return float(np.nanmean(distances(places, truth)))
