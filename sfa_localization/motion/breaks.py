@@ -105,14 +105,18 @@ def parted(odometry: Odometry) -> tuple[Odometry, str]:
     far = float(np.hypot(*(step - usual)[jump, :2].T).max())
     step = np.where(jump[:, None], usual, step)
     poses = chained(odometry.poses[0], step)
-    count = int(jump.sum())
-    joined = int((jump & ~cut).sum())
+    text = _jumps_text(far, int(jump.sum()), int((jump & ~cut).sum()), seconds.sum() / 60)
+    return replace(odometry, poses=poses), '; '.join(filter(None, (text, elsewhere)))
+
+
+def _jumps_text(far: float, count: int, joined: int, minutes: float) -> str:
+    """A sentence on `count` jumps by up to `far` m, of which so many are joined."""
     times = 'once' if count == 1 else f'{count} times'
     how = ['joined by its motion around'] * (joined > 0) + ['cut there'] * (joined < count)
     text = f'odometry pose jumps {times}, by up to {far:.2f} m: {" or ".join(how)}'
-    if joined > max(seconds.sum() / 60, 1.0):  # a driver is not reset so often
+    if joined > max(minutes, 1.0):  # a driver is not reset so often
         text += '; if a localization corrects it, record the frame odom instead of map'
-    return replace(odometry, poses=poses), '; '.join(filter(None, (text, elsewhere)))
+    return text
 
 
 def _goes_on_elsewhere(odometry: Odometry, pause: Mask, step: Array) -> str:

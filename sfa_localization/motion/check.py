@@ -157,11 +157,7 @@ def check_motion(
         _judge_following(check, sources, commands)
         _judge(check, 'turns')
         _judge_clocks(check)
-        if views is not None:
-            clock = check.image_drift or Drift(0, turns.late_s if turns else 0.0, 0.0)
-            taken_ns = views[0] - clock.late_ns(views[0])
-            check.odometry, texts = contradicted(check.odometry, taken_ns, views[1])
-            check.corrected += texts
+        _judge_breaks(check, views)
     of_images = [text for text in check.wrong if text.startswith(IMAGES)]
     if images is not None and not (of_images or any(IMAGES in (p.a, p.b) for p in check.pairs)):
         check.notes.append('images: too few of them, or turns, to tell whether they are mirrored')
@@ -169,6 +165,17 @@ def check_motion(
         check.notes += of_images
         check.wrong = [text for text in check.wrong if text not in of_images]
     return check
+
+
+def _judge_breaks(check: MotionCheck, views: StampedTextures | None) -> None:
+    """Break the odometry where the images contradict it."""
+    if views is None:
+        return
+    turns = check.pair(POSE, IMAGES)
+    clock = check.image_drift or Drift(0, turns.late_s if turns else 0.0, 0.0)
+    taken_ns = views[0] - clock.late_ns(views[0])
+    check.odometry, texts = contradicted(check.odometry, taken_ns, views[1])
+    check.corrected += texts
 
 
 def _judge_width(check: MotionCheck) -> None:
@@ -326,27 +333,31 @@ def _report(check: MotionCheck, kind: str, group: set[str], others: set[str], pa
     }[kind]
     verb = 'drives' if pair.what == 'way' else 'turn' if group == {IMAGES} else 'turns'
     text = f'{_listed(group)} {verb} {how} {_listed(others)}'
-    drastic = kind == 'sign' or (kind == 'scale' and not 1 / SKIDDING < factor < SKIDDING)
     if GYRO in group:
         _correct_gyro(check, kind, text, factor)
         return
-    if group == {IMAGES}:
+    drastic = kind == 'sign' or (kind == 'scale' and not 1 / SKIDDING < factor < SKIDDING)
+    if pair.what == 'way':
+        remedy = _WAY_REMEDIES[kind]
+        wrong = drastic
+    elif group == {IMAGES}:
         remedy = _IMAGES_REMEDIES[kind]
         if kind == 'sign' and _devices(others) == 1:
             remedy += ', or swap left and right wheel'
         # Skidding wheels turn farther than the robot does.
         images_err = factor > 1 or _devices(others) > 1
         wrong = {'alike': pair.independent, 'sign': True, 'scale': images_err}[kind]
-    elif pair.what == 'way':
-        remedy = _WAY_REMEDIES[kind]
-        wrong = drastic
-    elif group >= {POSE, TWIST}:
-        remedy = 'swap left and right wheel' if kind == 'sign' else 'do the wheels skid?'
-        wrong = drastic
     else:
-        remedy = 'correct its orientation' if POSE in group else 'correct twist.angular.z, in rad/s'
-        wrong = drastic or kind == 'alike'
+        remedy = _wheels_remedy(kind, group)
+        wrong = drastic or (kind == 'alike' and not group >= {POSE, TWIST})
     (check.wrong if wrong else check.notes).append(f'{text}: {remedy}')
+
+
+def _wheels_remedy(kind: str, group: set[str]) -> str:
+    """What to change where the turns by pose or twist, or both, differ."""
+    if group >= {POSE, TWIST}:
+        return 'swap left and right wheel' if kind == 'sign' else 'do the wheels skid?'
+    return 'correct its orientation' if POSE in group else 'correct twist.angular.z, in rad/s'
 
 
 def _listed(group: set[str]) -> str:
