@@ -37,6 +37,31 @@ TWINS = {
     'a filter for a model': (
         r'(fused|filter)\.expect\(', {'localizer.py', 'nodes/ekf_node.py'},
     ),
+    # Where a quantity is computed, by the calls that do it.
+    'delay between two sources': (
+        r'signal\.correlate\(|CLOCK_RANGE_S [*/]|CLOCK_RANGE_S\)',
+        {
+            'motion/sources.py', 'motion/clocks.py', 'motion/truth.py', 'fusion/camera_clock.py',
+            'bags/topic_stream.py', 'evaluation.py',
+        },
+    ),
+    'turns by images and odometry': (
+        r'\bestimated\(', {'motion/turns.py', 'mapping/drives.py', 'evaluation.py'},
+    ),
+    'way that wheels lose': (r'\bway_of\(', {'motion/odometry_errors.py', 'mapping/drives.py'}),
+    'steps beyond what a robot can do': (
+        r'(?<![\w.])beyond\(', {'data/odometry_steps.py', 'fusion/odometry.py', 'motion/breaks.py'},
+    ),
+    'places laid on others': (
+        r'\balign_complex\(',
+        {
+            'data/geometry.py', 'metric/measured_points.py', 'metric/point_ties.py',
+            'mapping/selection.py', 'mapping/learning.py', 'mapping/fitted_map.py',
+        },
+    ),
+    'weighted places and headings laid on a path': (
+        r'(?<!def )(?<![\w.])aligned\(', {'fusion/relocation.py', 'fusion/health.py'},
+    ),
 }  # fmt: skip
 """A pattern that stands for a rule, and the modules that may hold it."""
 

@@ -10,12 +10,13 @@ the images over each step of the odometry is compared with the usual one.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, Mask, relative
+from sfa_localization.data.geometry import Array, Indices, Mask, relative
 from sfa_localization.data.odometry_steps import JUMP, beyond, tolerance
 from sfa_localization.data.run import Odometry, Stamps, chained
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
@@ -52,16 +53,9 @@ def _jumps(odometry: Odometry) -> tuple[Mask, Array, float]:
     step = relative(odometry.poses[:-1], odometry.poses[1:])
     dt = np.diff(odometry.stamps_ns) * 1e-9
     period = max(float(np.median(dt)), 1e-3)
-    at = summed(dt)[:-1] + dt / 2
-    reach = max(_AROUND_S, 3 * period)
+    shortest_s, more_s = _times(dt, period)
     here = np.arange(len(step))
-    first = np.searchsorted(at, at - reach)
-    last = np.searchsorted(at, at + reach, 'right')
-    # Messages may be stamped late, or in bundles: a step took between `shortest_s` and `more_s`
-    # longer than that.
-    unsure_s = float(np.percentile(np.abs(dt - period), 90))
-    shortest_s = np.maximum(dt - unsure_s, 0.0)
-    more_s = np.maximum(dt, period) + unsure_s - shortest_s
+    first, last = _around(dt, max(_AROUND_S, 3 * period))
     single = np.pad(step / np.maximum(dt, period)[:, None], ((1, 1), (0, 0)), 'edge')
     values = np.column_stack([step, dt])
     jump = np.zeros(len(step), bool)
@@ -69,16 +63,49 @@ def _jumps(odometry: Odometry) -> tuple[Mask, Array, float]:
         sums = np.vstack([np.zeros(4), np.cumsum(values * ~jump[:, None], axis=0)])
         before = sums[here] - sums[first]
         after = sums[last] - sums[here + 1]
-        means = [each[:, :3] / np.maximum(each[:, 3:], period) for each in (before, after)]
-        usual = (before + after)[:, :3] / np.maximum((before + after)[:, 3:], period) * dt[:, None]
-        noise = MEDIAN_TO_STD * float(np.median(np.abs(step - usual)[:, :2].max(1)))
-        rest = [(step - v * shortest_s[:, None], v) for v in (*means, single[:-2], single[2:])]
-        distance = [
-            np.min([beyond(r[:, axes], more_s, [v[:, axes]]) for r, v in rest], axis=0)
-            for axes in (slice(0, 2), slice(2, 3))
-        ]
-        jump = np.max(distance, axis=0) > tolerance(np.maximum(dt, period), noise)
+        means = [_speed(each, period) for each in (before, after)]
+        usual = _speed(before + after, period) * dt[:, None]
+        noise = _noise(step - usual)
+        speeds = *means, single[:-2], single[2:]
+        jump = _beyond(step, speeds, shortest_s, more_s) > tolerance(np.maximum(dt, period), noise)
     return jump, usual, noise
+
+
+def _noise(missed: Array) -> float:
+    """The standard deviation, m, of steps (N, 3) from those expected."""
+    return MEDIAN_TO_STD * float(np.median(np.abs(missed)[:, :2].max(1)))
+
+
+def _times(dt: Array, period: float) -> tuple[Array, Array]:
+    """The shortest times (N,) s of steps that stamps `dt` (N,) s apart show, and how much longer
+    they may have been: messages may be stamped late, or in bundles.
+    """
+    unsure_s = float(np.percentile(np.abs(dt - period), 90))
+    shortest_s = np.maximum(dt - unsure_s, 0.0)
+    return shortest_s, np.maximum(dt, period) + unsure_s - shortest_s
+
+
+def _around(dt: Array, reach_s: float) -> tuple[Indices, Indices]:
+    """The first step (N,) near each step, and the one after the last."""
+    at = summed(dt)[:-1] + dt / 2
+    return np.searchsorted(at, at - reach_s), np.searchsorted(at, at + reach_s, 'right')
+
+
+def _speed(sums: Array, period: float) -> Array:
+    """Mean speeds (N, 3), m/s and rad/s, by sums (N, 4) of steps and of their seconds."""
+    return np.asarray(sums[:, :3] / np.maximum(sums[:, 3:], period))
+
+
+def _beyond(step: Array, speeds: Sequence[Array], shortest_s: Array, more_s: Array) -> Array:
+    """How far, m or rad, steps (N, 3) lie beyond where the nearest of the speeds (N, 3) leads in
+    the shortest time (N,) or up to `more_s` (N,) longer.
+    """
+    rest = [(step - speed * shortest_s[:, None], speed) for speed in speeds]
+    distances = [
+        np.min([beyond(left[:, axes], more_s, [speed[:, axes]]) for left, speed in rest], axis=0)
+        for axes in (slice(0, 2), slice(2, 3))
+    ]
+    return np.asarray(np.max(distances, axis=0))
 
 
 def parted(odometry: Odometry) -> tuple[Odometry, str]:
@@ -155,14 +182,24 @@ def contradicted(
     moved, length, still_s = (
         np.diff(np.interp(at, seconds, summed(sums))) for sums in (moved, length, still_s)
     )
-    likeness, turned_likeness = _likeness(small)
-    # Only ways ahead show what is usual: wheels may report turns of a robot that does not turn.
-    change = -np.log(likeness)
-    ahead = length > moved / 2
-    usual = quantile(change[ahead] / length[ahead], STRAIGHT) if ahead.any() else 0.0
-    stands = change < STILL * usual * length
-    other = turned_likeness < min(LIKE, float(np.quantile(turned_likeness, OTHER)))
-    other &= still_s > STOOD_S
+    stands, other = _unlike_wheels(small, moved, length, still_s)
+    return _broken(odometry, seconds, at, stands, other), _contradictions(at, stands, other)
+
+
+def _broken(odometry: Odometry, seconds: Array, at: Array, stands: Mask, other: Mask) -> Odometry:
+    """Odometry at `seconds` (M,) that breaks between images at seconds (N,) where these, in steps
+    (N - 1,), contradict the wheels.
+    """
+    # The wheels began to spin after the image before, and ended before the next one.
+    padded = np.pad(stands, 1)
+    unknown = np.pad(stands | other | padded[:-2] | padded[2:], 1)
+    unsure = unknown[np.searchsorted(at, seconds, 'right')]
+    breaks = (np.diff(odometry.part) != 0) | unsure[1:] | unsure[:-1]
+    return replace(odometry, part=summed(breaks).astype(np.int64))
+
+
+def _contradictions(at: Array, stands: Mask, other: Mask) -> list[str]:
+    """Sentences on the steps (N - 1,) between images at seconds (N,) that contradict the wheels."""
     sentences = {
         'the wheels turn from {:.1f} s to {:.1f} s while the images stand: cut there': stands,
         'images from {:.1f} s to {:.1f} s, while the wheels stand, move: cut there': other,
@@ -171,12 +208,25 @@ def contradicted(
     for text, mask in sentences.items():
         ends = np.flatnonzero(np.diff(np.pad(mask, 1).astype(int))).reshape(-1, 2)
         texts += [text.format(*at[pair]) for pair in ends]
-    # The wheels began to spin after the image before, and ended before the next one.
-    padded = np.pad(stands, 1)
-    unknown = np.pad(stands | other | padded[:-2] | padded[2:], 1)
-    unsure = unknown[np.searchsorted(at, seconds, 'right')]
-    breaks = (np.diff(odometry.part) != 0) | unsure[1:] | unsure[:-1]
-    return replace(odometry, part=summed(breaks).astype(np.int64)), texts
+    return texts
+
+
+def _unlike_wheels(
+    textures: NDArray[np.int8], moved: Array, length: Array, still_s: Array
+) -> tuple[Mask, Mask]:
+    """Masks (N - 1,) of the steps between images (N, ...) in which these stand while the wheels
+    turn, and show another place while the wheels stand.
+
+    Wheels `moved` (N - 1,) m and rad, of which `length` (N - 1,) m, and stood for `still_s`.
+    """
+    likeness, turned_likeness = _likeness(textures)
+    # Only ways ahead show what is usual: wheels may report turns of a robot that does not turn.
+    change = -np.log(likeness)
+    ahead = length > moved / 2
+    usual = quantile(change[ahead] / length[ahead], STRAIGHT) if ahead.any() else 0.0
+    stands = change < STILL * usual * length
+    other = turned_likeness < min(LIKE, float(np.quantile(turned_likeness, OTHER)))
+    return stands, other & (still_s > STOOD_S)
 
 
 def _likeness(textures: NDArray[np.int8]) -> tuple[Array, Array]:

@@ -86,6 +86,22 @@ def drift(a: Source, b: Source) -> Drift | None:
     seconds = (windows_ns[:, 0] - windows_ns[0, 0]) * 1e-9
     if not np.abs(turns).sum() >= _PARTS_MIN * PART_RAD:  # also turns that are unknown
         return None
+    line = _line_of_delays(turns, fast, windows_ns, seconds)
+    if line is None or not LATE_S / seconds[-1] < abs(line[1]) < RATE_MAX:
+        return None
+    delay_s, rate = line
+    at_ns = int(windows_ns[0, 0])
+    if slow is a:  # the line is over the time of `a`
+        return Drift(at_ns + round(delay_s * 1e9), delay_s, rate / (1 + rate))
+    return Drift(at_ns, -delay_s, -rate)
+
+
+def _line_of_delays(
+    turns: Array, fast: Source, windows_ns: Stamps, seconds: Array
+) -> tuple[float, float] | None:
+    """The delay at first, s, and its rate, of the fast source behind `turns` (M,) rad in windows
+    (M, 2) that begin at `seconds` (M,); None where too few parts agree, or a rate is by chance.
+    """
     first = _parts(turns)
     at_s = np.add.reduceat(np.abs(turns) * seconds, first) / np.add.reduceat(np.abs(turns), first)
     more_s, near = _delays(turns, fast, windows_ns, first)
@@ -102,12 +118,7 @@ def drift(a: Source, b: Source) -> Drift | None:
         line = linregress(at_s[near], (delay_s + rate * at_s + more_s)[near])
         rate = float(line.slope)
         delay_s = float(line.intercept)
-    if line.pvalue > CHANCE or not LATE_S / seconds[-1] < abs(rate) < RATE_MAX:
-        return None
-    at_ns = int(windows_ns[0, 0])
-    if slow is a:  # the line is over the time of `a`
-        return Drift(at_ns + round(delay_s * 1e9), delay_s, rate / (1 + rate))
-    return Drift(at_ns, -delay_s, -rate)
+    return None if line.pvalue > CHANCE else (delay_s, rate)
 
 
 def _parts(turns: Array) -> Indices:

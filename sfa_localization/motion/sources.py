@@ -240,6 +240,18 @@ def _regressed(what: str, a: Source, b: Source, x: Array, y: Array) -> Pair | No
     # Shifts between images may err by any angle.
     limit = np.minimum(limit, 2 * limit[::-1]) if IMAGES in (a.name, b.name) else limit
     u, v = (np.clip(s, -FAR * q, FAR * q) for s, q in zip((x, y), limit, strict=True))
+    best, correlation, scale, moves = _best_delay(x, y, u, v, limit)
+    period_s = max(source.period_s for source in (a, b) if source.name != IMAGES)
+    delay_s = _certain_delay(correlation, best, moves)
+    return Pair(what, a.name, b.name, scale, delay_s, float(correlation[best]), period_s)
+
+
+def _best_delay(
+    x: Array, y: Array, u: Array, v: Array, limit: Array
+) -> tuple[int, Array, float, int]:
+    """The row at which motions (D, M), clipped to u and v, correlate best, the correlations (D,),
+    the scale there, and how many windows move; `limit` (2,) are the typical steps.
+    """
     inlier = np.ones(x.shape[1], bool)
     for _ in range(2):
         power = (u[:, inlier] ** 2).sum(1) * (v[:, inlier] ** 2).sum(1)
@@ -252,15 +264,18 @@ def _regressed(what: str, a: Source, b: Source, x: Array, y: Array) -> Pair | No
         moves = np.abs(u[best]) > limit[0] / 4
         std = MEDIAN_TO_STD * float(np.median(residual[moves])) if moves.any() else np.inf
         inlier = residual <= max(FAR * std, limit[1] / 2)
+    return best, correlation, scale, int(moves.sum())
+
+
+def _certain_delay(correlation: Array, best: int, moves: int) -> float | None:
+    """The delay of the best correlation (D,), s; None where others fit as well."""
     # Delays whose correlation is within one standard deviation of the best.
-    chance = (1 - correlation[best] ** 2) / np.sqrt(max(moves.sum(), 1))
+    chance = (1 - correlation[best] ** 2) / np.sqrt(max(moves, 1))
     as_good = GRID[correlation >= correlation[best] - chance - 1e-3]
-    delay_s = None
-    if 0 < best < len(GRID) - 1 and np.ptp(as_good) / 4 < _STD_MAX_S:
-        peak = float(parabola_peak(*correlation[best - 1 : best + 2]))
-        delay_s = float(GRID[best] + peak * (GRID[1] - GRID[0]))
-    period_s = max(source.period_s for source in (a, b) if source.name != IMAGES)
-    return Pair(what, a.name, b.name, scale, delay_s, float(correlation[best]), period_s)
+    if not 0 < best < len(GRID) - 1 or np.ptp(as_good) / 4 >= _STD_MAX_S:
+        return None
+    peak = float(parabola_peak(*correlation[best - 1 : best + 2]))
+    return float(GRID[best] + peak * (GRID[1] - GRID[0]))
 
 
 def compare_map(odometry: Odometry, stamps_ns: Stamps, poses: Array) -> Pair | None:
