@@ -7,10 +7,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from cylinder_worlds import Spheres, place, recipe, run_in, visit, wander
+from cylinder_worlds import Spheres, lanes, place, recipe, run_in, visit, wander
 from numpy.testing import assert_allclose
 from places import distances, lengths
-from test_keyframes import HOME, drive, errors, familiar, keyframes_of, unseen
+from test_keyframes import HOME, errors, familiar, keyframes_of, unseen
 
 from sfa_localization.camera.leveling import NEAR_NS, tilted, tilts_at
 from sfa_localization.camera.settings import PanoramaConfig
@@ -61,7 +61,7 @@ def swayed(images, degrees, seed, sphere=SPHERE):
 
 @cache
 def learnt():
-    return keyframes_of([HOME.panoramas(drive(), CONFIG)], [drive()], [0], CONFIG)
+    return keyframes_of([HOME.panoramas(lanes(), CONFIG)], [lanes()], [0], CONFIG)
 
 
 def test_a_tilted_image_is_located_like_a_level_one():
