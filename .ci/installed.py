@@ -12,11 +12,12 @@ from pathlib import Path
 from ament_index_python import get_package_prefix, get_package_share_directory
 
 import sfa_localization
-from sfa_localization.cli import COMMANDS, NODES
+from sfa_localization.cli import COMMANDS
+from sfa_localization.nodes.process import EXECUTABLES as PROCESSES
 
 NAME = 'sfa_localization'
 SHARED = ('package.xml', 'config/localization.launch.py', 'config/localization.yaml')
-EXECUTABLES = (NAME, *COMMANDS, *NODES)
+EXECUTABLES = (NAME, *COMMANDS, *PROCESSES)
 
 
 def missing() -> list[str]:
@@ -50,7 +51,7 @@ def main() -> int:
         if not problems and subprocess.run(words, stdout=subprocess.PIPE).returncode:
             problems.append(f'fails: {" ".join(map(str, words))}')
     if not problems:
-        problems += [f'does not start: {node}' for node in NODES if not starts(folder / node)]
+        problems += [f'does not start: {node}' for node in PROCESSES if not starts(folder / node)]
     built = f'{prefix}, built with setuptools {version("setuptools")}'
     print('\n'.join(problems) or f'{built}: all files are there, and the nodes start')
     return bool(problems)

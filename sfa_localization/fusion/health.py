@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, Complex
+from sfa_localization.data.rig import TURN_FACTOR_STD
 from sfa_localization.fusion.belief import LONGEST_DELAY_S, Columns, DrivenPath, PositionFix
 from sfa_localization.fusion.relocation import AGREEING_M, aligned, centered, summed
 
@@ -59,6 +60,9 @@ DELAYS: Array = np.r_[-1.5:-0.2:0.3, 0.3, 0.6 : LONGEST_DELAY_S + 0.1 : 0.4]
 FACTORS: Array = np.exp(np.delete(np.arange(-10, 11), 10) * 0.05)
 """Grid of turn factors, in addition to the learned one: tracks skid. A twentieth of the turns in a
 window is about the heading error that images allow."""
+EXPECTED = 4 * TURN_FACTOR_STD
+"""Nearer to the learned factor, the state of the filter follows by itself: real wheels are off by
+up to a tenth, and turn on the spot."""
 LONGEST_M = 16.0
 """An estimate that was placed anew again and again is confirmed over this distance at most."""
 _ANYWHERE = 1 / (100.0 * 2 * math.pi)
@@ -198,10 +202,11 @@ class _Window:
         beyond = (FACTORS[:, None] - 1.0) * (yaws - yaws[:, :1])
         between = np.exp(1j * (beyond[:, 1:] + beyond[:, :-1]) / 2)
         ways = np.cumsum(between * np.diff(places), axis=1)
-        harmful = np.abs(FACTORS - 1) * np.ptp(yaws[0, self._is_recent]) > HARMLESS_RAD
+        unexpected = np.abs(FACTORS - 1) > EXPECTED
+        misturned = np.abs(FACTORS - 1) * np.ptp(yaws[0, self._is_recent]) > HARMLESS_RAD
         turned_places = np.insert(ways, 0, 0.0, axis=1)
         fits = self._fitted(turned_places, yaws + beyond, PRIOR / len(FACTORS))
-        for each in zip(fits.log, FACTORS, harmful, strict=True):
+        for each in zip(fits.log, FACTORS, unexpected & misturned, strict=True):
             yield _Hypothesis('wheels', *each)
 
     def _with_lever(self, places: Complex, yaws: Array) -> _Hypothesis:
