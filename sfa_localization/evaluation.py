@@ -53,8 +53,8 @@ from sfa_localization.motion.check import MotionCheck, check_motion
 from sfa_localization.motion.clocks import Drift
 from sfa_localization.motion.dead_reckoning import OdometryTrack, Way
 from sfa_localization.motion.settings import SegmentConfig
-from sfa_localization.motion.truth import TruePoses, true_poses
-from sfa_localization.motion.turns import Headings, estimated
+from sfa_localization.motion.truth import NO_OFFSET, TruePoses, true_poses
+from sfa_localization.motion.turns import Headings, by_images
 from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
@@ -134,7 +134,7 @@ def evaluate(
         drives.append(_located(path, Observer(model, watch), here, progress))
         recipe = replace(recipe, origin=drives[-1].run.origin)
     localizer = Localizer(model, config, watch, Smoother if smooth else PoseFilter)
-    usual = np.median([drive.true.offset for drive in drives] or [(0.0, 0.0, 0.0)], axis=0)
+    usual = np.median([drive.true.offset for drive in drives] or [NO_OFFSET], axis=0)
     drives.append(_located(bag, localizer.observer, recipe, progress, usual.tolist()))
     aligned_on = 'nothing: coordinates of the map'
     if transform is None:
@@ -248,7 +248,7 @@ def _compared(
     turns: tuple[Stamps, Array],
     open_loop: bool,
     rig: Rig,
-    usual: Sequence[float] = (0.0, 0.0, 0.0),
+    usual: Sequence[float] = NO_OFFSET,
 ) -> tuple[MotionCheck, TruePoses, CameraClock]:
     """The comparison of the sources of motion, the poses of base_link by the ground truth, as
     compared with the odometry, corrected as in training, and the camera's clock. Raises DataError
@@ -258,11 +258,10 @@ def _compared(
     check = check_motion(run.odometry, turns, run.yaw_rate, commands=open_loop)
     track = OdometryTrack.of(check.odometry, SegmentConfig(), check.gyro)
     clock = camera_clock(run.odometry, *turns)
-    (stamps_ns, headings) = turns
+    stamps_ns, headings = turns
     stamps_ns = stamps_ns - clock.delay_ns
-    shown = [Headings.of(track, stamps_ns, headings.tolist())] if len(stamps_ns) > 1 else []
-    for turns_of in (shown and estimated(shown, Closures.none())) or ():
-        track = track.corrected(stamps_ns, turns_of.add, turns_of.variance)
+    shown = Headings.of(track, stamps_ns, headings.tolist())
+    (track,) = by_images([track], [shown], Closures.none())
     track = track.driven(Way(rig.wheel_scale.value, rig.turn_loss, rig.speed_offset))
     try:
         true = true_poses(run.ground_truth, track, check.confirmed, open_loop, usual)
@@ -276,7 +275,7 @@ def _located(
     observer: Observer,
     recipe: Recipe,
     progress: bool,
-    usual: Sequence[float] = (0.0, 0.0, 0.0),
+    usual: Sequence[float] = NO_OFFSET,
 ) -> _Located:
     """Locate the images of a bag; the `usual` offset of the truth is that of other drives. Raises
     BagError or DataError.

@@ -46,7 +46,7 @@ TWINS = {
         },
     ),
     'turns by images and odometry': (
-        r'\bestimated\(', {'motion/turns.py', 'mapping/drives.py', 'evaluation.py'},
+        r'\bestimated\(', {'motion/turns.py', 'mapping/drives.py'},
     ),
     'way that wheels lose': (r'\bway_of\(', {'motion/odometry_errors.py', 'mapping/drives.py'}),
     'steps beyond what a robot can do': (

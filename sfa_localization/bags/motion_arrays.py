@@ -76,7 +76,7 @@ def to_odometry(values: StampedValues, topic: str) -> tuple[Odometry, list[str],
     aside = _aside(stamps, rows, topic)
     kept = ~(empty | aside)
     stamps = stamps[kept]
-    (poses, twists, variances) = np.split(rows[kept], (3, 5), axis=1)
+    poses, twists, variances = np.split(rows[kept], (3, 5), axis=1)
     if values and values[0][1][1] is None:
         twists = differences(stamps, poses)
     odometry, oddity = _filled(Odometry(stamps, poses, twists, variances))

@@ -169,8 +169,8 @@ def clock_offset(name: str, stream: Stream, odometry: Stream) -> tuple[int, str]
     both, and a sentence; 0 and '' for less than turns show, and for bags that do not hold the times
     of reception; 0 also for what queues may have delayed.
     """
-    (ahead, spread) = stream.ahead_ns
-    (other, other_spread) = odometry.ahead_ns
+    ahead, spread = stream.ahead_ns
+    other, other_spread = odometry.ahead_ns
     offset_ns = whole_leap(ahead - other)
     range_ns = CLOCK_RANGE_S * 1e9
     # If a bag holds no times of reception, stamps are ahead by the length of the drive.

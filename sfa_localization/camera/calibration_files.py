@@ -133,8 +133,8 @@ def _from_ocam(text: str) -> dict[str, Any]:
     numbers = [[float(entry) for entry in row] for row in rows]
     if len(numbers) < 5 or int(numbers[0][0]) != len(numbers[0]) - 1:
         raise CameraError('not the five rows of OCamCalib calib_results.txt')
-    (cy, cx) = numbers[2]
-    (height, width) = numbers[4]
+    cy, cx = numbers[2]
+    height, width = numbers[4]
     size = {'image_width': int(width), 'image_height': int(height)}
     lens = {'polynomial': tuple(numbers[0][1:]), 'affine': tuple(numbers[3])}
     return {'camera_model': 'ocam', 'cx': cx, 'cy': cy, **size, **lens}

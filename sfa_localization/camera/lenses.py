@@ -118,8 +118,8 @@ class RadialLens:
 
     def _shift(self, plane: Array) -> Array:
         """The tangential part of a distortion (N, 2)."""
-        (p1, p2) = self.tangential
-        (x, y) = plane.T
+        p1, p2 = self.tangential
+        x, y = plane.T
         shift_x = 2 * p1 * x * y + p2 * (3 * x**2 + y**2)
         shift_y = p1 * (x**2 + 3 * y**2) + 2 * p2 * x * y
         return np.column_stack([shift_x, shift_y])

@@ -48,8 +48,8 @@ def run(arguments: argparse.Namespace) -> int:
     options.require_output(image, [arguments.model], '.pgm')
     config = options.settings(GroundConfig, arguments)
     cells = PlaceModel.load(arguments.model).ground.cells(config)
-    (height, width) = cells.driven.shape
-    (x, y) = cells.corner
+    height, width = cells.driven.shape
+    x, y = cells.corner
     gray = np.where(cells.driven[::-1], _FREE, _UNKNOWN).astype(np.uint8)
     write_bytes(image, f'P5\n{width} {height}\n255\n'.encode() + gray.tobytes())
     write_bytes(output, _YAML.format(image=image.name, cell=config.cell, x=x, y=y).encode())

@@ -14,8 +14,8 @@ from sfa_localization.data.geometry import Array
 
 def rotation(roll: float, pitch: float, yaw: float = 0.0) -> Array:
     """The rotation (3, 3) from the axes of a body at roll, pitch and yaw, rad, to level axes."""
-    (a, b, c) = np.cos([roll, pitch, yaw])
-    (i, j, k) = np.sin([roll, pitch, yaw])
+    a, b, c = np.cos([roll, pitch, yaw])
+    i, j, k = np.sin([roll, pitch, yaw])
     about_x = np.array([[1, 0, 0], [0, a, -i], [0, i, a]])
     about_y = np.array([[b, 0, j], [0, 1, 0], [-j, 0, b]])
     about_z = np.array([[c, -k, 0], [k, c, 0], [0, 0, 1]])

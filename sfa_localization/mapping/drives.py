@@ -36,7 +36,7 @@ from sfa_localization.motion.dead_reckoning import OdometryTrack, Way
 from sfa_localization.motion.odometry_errors import way_of
 from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.motion.sources import compare_map
-from sfa_localization.motion.turns import Headings, estimated
+from sfa_localization.motion.turns import Headings, by_images, estimated
 
 Maps = tuple[MetricResult, TurnedMaps | None, MetricResult]
 """The first map, turned maps, and the map of these, or the first again."""
@@ -97,14 +97,7 @@ class Drives:
     def _estimated_tracks(self) -> list[OdometryTrack]:
         runs = [drive.run for drive in self.items]
         tracks = [OdometryTrack.of(run.odometry, self.config, run.yaw_rate) for run in runs]
-        turns = estimated(self._headings(tracks), self.closures)
-        if turns is None:
-            return tracks
-        changes = zip(tracks, self.items, turns, strict=True)
-        return [
-            track.corrected(drive.stamps_ns, each.add, each.variance)
-            for track, drive, each in changes
-        ]
+        return by_images(tracks, self._headings(tracks), self.closures)
 
     def turn_factors(self) -> list[Quantity]:
         """Of each drive, true turns over those of the odometry, by images; none if these do not

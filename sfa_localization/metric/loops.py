@@ -143,7 +143,7 @@ def with_closures(segments: Segments, closures: Closures) -> Segments:
     """
     stack = Stack.of(segments)
     owner = stack.owner
-    (x, y, yaw) = stack.starts[stack.owner].T
+    x, y, yaw = stack.starts[stack.owner].T
     places = x + 1j * y + np.exp(1j * yaw) * stack.path
     driven = np.cumsum(stack.steps)
     # And the distance from the last image of a segment to the first one of the next.

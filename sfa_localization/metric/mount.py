@@ -147,7 +147,7 @@ class Mount:
         if self.turning is None:
             return 0.0
         square = abs(lever) ** 2
-        (measured, std) = self.turning
+        measured, std = self.turning
         variance = std**2 + LEVEL_M2**2 + (UNSURE * square) ** 2
         return -(((square - measured) ** 2) / variance + math.log(variance)) / 2
 
@@ -156,7 +156,7 @@ class Mount:
         """The sentence that says how images contradict a measured lever arm, or ''."""
         if self.given is None or self.learned is None:
             return ''
-        (lever, std) = self.learned
+        lever, std = self.learned
         given = self.given
         if abs(lever - given) < CONTRADICTS * math.hypot(std, GIVEN_STD_M):
             return ''

@@ -34,6 +34,8 @@ from sfa_localization.motion.sources import ALIKE, EQUAL, LATE_S, late
 
 TRUTH = 'ground truth'
 POINTS = 'points_topic'
+NO_OFFSET = 0.0, 0.0, 0.0
+"""m ahead and to the left of base_link, and delay, s."""
 WINDOW_M = 3.0
 WINDOWS_MIN = 4
 NOISE_M = 0.01
@@ -74,7 +76,7 @@ class TruePoses:
     poses: Trajectory
     headings: bool = True
     sentences: tuple[str, ...] = ()
-    offset: tuple[float, ...] = (0.0, 0.0, 0.0)
+    offset: tuple[float, ...] = NO_OFFSET
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +178,7 @@ class _Comparison:
     """Places of a truth, m, at N times in s, and the odometry of the drive."""
 
     def __init__(
-        self, truth: Trajectory, track: OdometryTrack, usual: Sequence[float] = (0.0, 0.0, 0.0)
+        self, truth: Trajectory, track: OdometryTrack, usual: Sequence[float] = NO_OFFSET
     ) -> None:
         self.usual = np.array([*usual, 0.0])
         self.track = track
@@ -370,7 +372,7 @@ def true_poses(
     track: OdometryTrack,
     trusted: bool = True,
     open_loop: bool = False,
-    usual: Sequence[float] = (0.0, 0.0, 0.0),
+    usual: Sequence[float] = NO_OFFSET,
 ) -> TruePoses:
     """The poses of base_link by a ground truth, which is compared with the odometry of the drive.
 

@@ -64,6 +64,7 @@ class Headings:
     """One drive at its N images: unwrapped headings, rad, by the `track` of the odometry, and by
     the sum of the shifts between `images`, whose sign may be either; the way driven, m."""
 
+    stamps_ns: Stamps
     time_s: Array
     track: Array
     images: Array
@@ -83,7 +84,7 @@ class Headings:
         way_m = np.interp(time_s, track.seconds, track.length)
         bridged = np.interp(time_s, track.seconds, track.bridged[:, 1])
         shown = np.unwrap(np.asarray(images, float))
-        return cls(time_s, yaw, shown, part, way_m, bridged, track.by_gyro)
+        return cls(stamps_ns, time_s, yaw, shown, part, way_m, bridged, track.by_gyro)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,7 @@ def estimated(drives: Sequence[Headings], closures: Closures) -> list[Turns] | N
     """The turns of each drive; None where images turn otherwise than the odometry, and where
     `closures`, which number the images of all drives, show that the odometry turns better.
     """
-    if _odometry_is_better(drives, closures):
+    if not all(len(drive.track) for drive in drives) or _odometry_is_better(drives, closures):
         return None
     steps = _Steps.of(drives)
     if steps.correlation < ALIKE:
@@ -112,6 +113,17 @@ def estimated(drives: Sequence[Headings], closures: Closures) -> list[Turns] | N
         Turns(summed(added), summed(variances), Quantity(1 + float(value), float(std)))
         for added, variances, value, std in parts
     ]
+
+
+def by_images(
+    tracks: Sequence[OdometryTrack], headings: Sequence[Headings], closures: Closures
+) -> list[OdometryTrack]:
+    """The tracks with the turns of their images, where these are `estimated`."""
+    turns = estimated(headings, closures)
+    if turns is None:
+        return list(tracks)
+    changes = zip(tracks, headings, turns, strict=True)
+    return [track.corrected(at.stamps_ns, each.add, each.variance) for track, at, each in changes]
 
 
 def _odometry_is_better(drives: Sequence[Headings], closures: Closures) -> bool:

@@ -46,9 +46,8 @@ from sfa_localization.place_model import camera_of
 
 _DEMAND_PERIOD_S = 0.1  # between checks for subscribers: a new one waits no longer for images
 _LITTLE_VISIBLE = 0.5  # a smaller visible share of the panorama gives a warning
-# the number kept: those of a second or more
 _IMU = 'imu/data'
-_ORIENTATIONS = 500
+_ORIENTATIONS = 500  # the number kept: those of a second or more
 _CAMERA_INFO = 'camera_info'
 
 

@@ -80,8 +80,8 @@ def box(
     center: Array, size: Array, surface: str, tint: Tint, low: float = 0.0, step: float = 0.5
 ) -> list[Shape]:
     """An upright box without a bottom: `center` (x, y), `size` (x, y, height) in meters."""
-    (x, y) = center
-    (w, d, h) = size
+    x, y = center
+    w, d, h = size
     west = x - w / 2
     east = x + w / 2
     south = y - d / 2
