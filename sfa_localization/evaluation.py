@@ -50,9 +50,9 @@ from sfa_localization.fusion.status import Level
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.localizer import Localizer
 from sfa_localization.motion.check import MotionCheck, check_motion
-from sfa_localization.motion.clocks import Drift
 from sfa_localization.motion.dead_reckoning import OdometryTrack, Way
 from sfa_localization.motion.settings import SegmentConfig
+from sfa_localization.motion.sources import Drift
 from sfa_localization.motion.truth import NO_OFFSET, TruePoses, true_poses
 from sfa_localization.motion.turns import Headings, by_images
 from sfa_localization.observer import Observation, Observer

@@ -41,7 +41,7 @@ TWINS = {
     'delay between two sources': (
         r'signal\.correlate\(|CLOCK_RANGE_S [*/]|CLOCK_RANGE_S\)',
         {
-            'motion/sources.py', 'motion/clocks.py', 'motion/truth.py', 'fusion/camera_clock.py',
+            'motion/fit.py', 'motion/truth.py', 'fusion/camera_clock.py',
             'bags/topic_stream.py', 'evaluation.py',
         },
     ),

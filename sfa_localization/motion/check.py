@@ -21,8 +21,8 @@ from sfa_localization.data.odometry_steps import JUMP, NOISE
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
 from sfa_localization.motion.breaks import StampedTextures, contradicted, parted
-from sfa_localization.motion.clocks import Drift, drift_sentences, drifts, following
-from sfa_localization.motion.gyro import cleaned
+from sfa_localization.motion.fit import compare, drift_sentences, drifts, following
+from sfa_localization.motion.gyro import cleaned, smoothed
 from sfa_localization.motion.sources import (
     CERTAIN,
     ENOUGH,
@@ -32,9 +32,9 @@ from sfa_localization.motion.sources import (
     IMAGES,
     POSE,
     TWIST,
+    Drift,
     Pair,
     Source,
-    compare,
     late,
     sources_of,
     unit,
@@ -59,18 +59,24 @@ askew) is corrected if its scatter is below the second value; slipping wheels sc
 _STAMPS_MIN = 20
 _STAMPS_MIN_PER_S = 3
 _UNITS = ((1, 'nothing'), (1_000, 'milliseconds'), (1_000_000, 'microseconds'))
-_IMAGES_REMEDIES = {
-    'alike': 'switch direction lock and stabilization off, and record one omnidirectional camera',
-    'sign': 'set `clockwise` of the panorama, or `mirrored` of the calibration',
-    'scale': 'a panorama shows all around once, so that a full turn shifts it by its width; or is '
-    'the track of the wheels too wide?',
-}
 _STABILIZED = 'switch stabilization off (direction lock, FlowState, horizon lock)'
-_WAY_REMEDIES = {
-    'alike': 'is the heading of the pose right?',
-    'sign': 'correct the sign of twist.linear.x, or the heading of the pose',
-    'scale': 'publish m and m/s',
+ODOMETRY = 'odometry'
+_REMEDIES = {
+    (IMAGES, 'turns', 'alike'): 'switch direction lock and stabilization off, and record one '
+    'omnidirectional camera',
+    (IMAGES, 'turns', 'sign'): 'set `clockwise` of the panorama, or `mirrored` of the calibration',
+    (IMAGES, 'turns', 'scale'): 'a panorama shows all around once, so that a full turn shifts it '
+    'by its width; or is the track of the wheels too wide?',
+    (ODOMETRY, 'turns', 'sign'): 'swap left and right wheel',
+    (ODOMETRY, 'turns', 'alike'): 'do the wheels skid?',
+    (ODOMETRY, 'turns', 'scale'): 'do the wheels skid?',
+    (POSE, 'turns', ''): 'correct its orientation',
+    (TWIST, 'turns', ''): 'correct twist.angular.z, in rad/s',
+    ('', 'way', 'alike'): 'is the heading of the pose right?',
+    ('', 'way', 'sign'): 'correct the sign of twist.linear.x, or the heading of the pose',
+    ('', 'way', 'scale'): 'publish m and m/s',
 }
+"""What to change where a source, or any, differs from the others by this kind, or by any."""
 
 
 @dataclass
@@ -269,7 +275,8 @@ def _repaired(
     for change in parted, _straightened:
         check.odometry, text = change(check.odometry)
         check.corrected += [text] if text else []
-    drifting = drifts(sources_of(check.odometry, images, check.gyro))
+    gyro = None if check.gyro is None else smoothed(check.gyro)
+    drifting = drifts(sources_of(check.odometry, images, gyro))
     check.timing += drift_sentences(drifting)
     check.corrected += check.timing
     if check.gyro is not None and GYRO in drifting:
@@ -336,33 +343,36 @@ def _report(check: MotionCheck, kind: str, group: set[str], others: set[str], pa
     if GYRO in group:
         _correct_gyro(check, kind, text, factor)
         return
-    drastic = kind == 'sign' or (kind == 'scale' and not 1 / SKIDDING < factor < SKIDDING)
-    if pair.what == 'way':
-        remedy = _WAY_REMEDIES[kind]
-        wrong = drastic
-    elif group == {IMAGES}:
-        remedy = _IMAGES_REMEDIES[kind]
-        if kind == 'sign' and _devices(others) == 1:
-            remedy += ', or swap left and right wheel'
+    faulty = _faulty(group)
+    remedy = _remedy(faulty, pair.what, kind)
+    wrong = kind == 'sign' or (kind == 'scale' and not 1 / SKIDDING < factor < SKIDDING)
+    if pair.what == 'turns' and faulty == IMAGES:
         # Skidding wheels turn farther than the robot does.
         images_err = factor > 1 or _devices(others) > 1
         wrong = {'alike': pair.independent, 'sign': True, 'scale': images_err}[kind]
-    else:
-        remedy = _wheels_remedy(kind, group)
-        wrong = drastic or (kind == 'alike' and not group >= {POSE, TWIST})
+        if kind == 'sign' and _devices(others) == 1:
+            remedy += f', or {_REMEDIES[ODOMETRY, "turns", "sign"]}'
+    elif pair.what == 'turns' and kind == 'alike':
+        wrong = faulty != ODOMETRY
     (check.wrong if wrong else check.notes).append(f'{text}: {remedy}')
 
 
-def _wheels_remedy(kind: str, group: set[str]) -> str:
-    """What to change where the turns by pose or twist, or both, differ."""
+def _faulty(group: set[str]) -> str:
+    """The source, or both of the wheels, to change in a group that differs."""
     if group >= {POSE, TWIST}:
-        return 'swap left and right wheel' if kind == 'sign' else 'do the wheels skid?'
-    return 'correct its orientation' if POSE in group else 'correct twist.angular.z, in rad/s'
+        return ODOMETRY
+    return next(name for name in (POSE, TWIST, IMAGES) if name in group)
+
+
+def _remedy(faulty: str, what: str, kind: str) -> str:
+    """What to change where a source differs from the others by its turns or way."""
+    rows = (faulty, what, kind), (faulty, what, ''), ('', what, kind)
+    return next(_REMEDIES[row] for row in rows if row in _REMEDIES)
 
 
 def _listed(group: set[str]) -> str:
     """The names of sources, in words."""
-    wheels = ['odometry'] if {POSE, TWIST} <= group else sorted(group & {POSE, TWIST})
+    wheels = [ODOMETRY] if {POSE, TWIST} <= group else sorted(group & {POSE, TWIST})
     return ' and '.join([*wheels, *sorted(group - {POSE, TWIST})])
 
 

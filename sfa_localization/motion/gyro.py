@@ -18,6 +18,7 @@ from sfa_localization.data.geometry import Array, Mask, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
 from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile, surprise
 from sfa_localization.motion.dead_reckoning import GAP_MAX_S, without_pause
+from sfa_localization.motion.fit import compare
 from sfa_localization.motion.samples import OUTLIER, fault_sentence, faulty
 from sfa_localization.motion.sources import (
     EQUAL,
@@ -25,7 +26,6 @@ from sfa_localization.motion.sources import (
     IMAGES,
     POSE,
     Source,
-    compare,
     sources_of,
 )
 
@@ -40,6 +40,11 @@ _SHIFTS = 9
 _UNITS = 1.0, 180 / np.pi  # rad/s and degrees/s
 
 
+def smoothed(gyro: YawRate) -> YawRate:
+    """Without single faulty samples, which do not matter for a clock."""
+    return replace(gyro, omega=ndimage.median_filter(gyro.omega, 5, mode='nearest'))
+
+
 def cleaned(
     odometry: Odometry, images: tuple[Stamps, Array] | None, gyro: YawRate | None
 ) -> tuple[YawRate | None, str]:
@@ -48,9 +53,7 @@ def cleaned(
     """
     if gyro is None:
         return None, ''
-    # Single faulty samples do not matter for the delay.
-    smooth = ndimage.median_filter(gyro.omega, 5, mode='nearest')
-    compared = _compared(odometry, images, replace(gyro, omega=smooth))
+    compared = _compared(odometry, images, smoothed(gyro))
     if not compared:
         return gyro, ''
     (wheels, _), (rates, factor), (views, scale) = compared

@@ -13,11 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfa_localization.data.events import CLOCK_RANGE_S
 from sfa_localization.data.geometry import Array, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
-from sfa_localization.data.statistics import MEDIAN_TO_STD, parabola_peak, quantile
-from sfa_localization.motion.dead_reckoning import summed, without_pause
+from sfa_localization.motion.dead_reckoning import summed
 
 IMAGES = 'images'
 POSE = 'odometry pose'
@@ -42,18 +40,6 @@ CERTAIN = 0.95
 turn were within 3 %."""
 LATE_S = 0.05
 """Smaller delays are within the period of usual messages."""
-GRID = np.arange(-50, 51) * (CLOCK_RANGE_S / 50)
-"""Delays, s."""
-FAR = 3.0
-"""Steps beyond so many times the typical one are clipped, and errors beyond so many standard
-deviations take no part."""
-# Windows are lengthened until half of the motion is in windows with _STEP (rad, m) or more.
-_WINDOWS_S = 0.19 * 2.0 ** np.arange(4)
-_STEP = 0.1
-_WINDOWS_MAX = 3000
-_PAUSE_S = 1.0
-# A delay is certain if the delays that fit nearly as well scatter by less than this, s.
-_STD_MAX_S = 0.06
 # Distance, m, over which maps and odometry are compared: many times the error of one image.
 _STRETCH_M = 10.0
 
@@ -161,6 +147,23 @@ class Pair:
         return f'{self.b} {verb} {", ".join(parts)}' if parts else 'alike'
 
 
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """A clock that is `delay_s` late at a stamp of its own, and gains `rate` s in each second."""
+
+    at_ns: int
+    delay_s: float
+    rate: float
+
+    def late_ns(self, stamps_ns: Stamps) -> Stamps:
+        """By how much its stamps (N,) are late."""
+        late_ns = self.delay_s * 1e9 + self.rate * (stamps_ns - self.at_ns)
+        return np.round(late_ns).astype(np.int64)
+
+    def __str__(self) -> str:
+        return f'{abs(self.rate) * 100:#.2g} % {"fast" if self.rate > 0 else "slow"}'
+
+
 HEAD = ('compared', 'by', 'scale', 'delay (s)', 'correlation', 'this means')
 
 
@@ -177,105 +180,6 @@ def unit(pair: Pair) -> str:
             if 1 / EQUAL < scale / factor < EQUAL:
                 return f' ({source} in {name}?)'
     return ''
-
-
-def compare(a: Source, b: Source, what: str = 'turns') -> Pair | None:
-    """Compare two sources; None where they measured too little motion at the same time."""
-    chosen = in_windows(a, b, what)
-    if chosen is None:
-        return None
-    slow, fast, windows = chosen
-    # Where `b` is late, it reports later what `a` has reported.
-    delays = (GRID if slow is a else -GRID)[:, None, None]
-    moving = fast.moved(windows + np.round(delays * 1e9).astype(np.int64), what)
-    fixed = np.broadcast_to(slow.moved(windows, what), moving.shape)
-    x, y = (fixed, moving) if slow is a else (moving, fixed)
-    return _regressed(what, a, b, x, y)
-
-
-def in_windows(a: Source, b: Source, what: str) -> tuple[Source, Source, Stamps] | None:
-    """The slower and the faster source, and windows (M, 2) ns between messages of the slower one
-    that are long enough for steps that stand out; None without any.
-    """
-    slow, fast = sorted((a, b), key=lambda source: -source.period_s)
-    if what not in slow.sums or what not in fast.sums:
-        return None
-    for length_s in _WINDOWS_S:
-        windows = _windows(slow, fast, length_s)
-        if not len(windows):
-            return None
-        if typical(slow.moved(windows, what)) >= _STEP:
-            break
-    return slow, fast, windows
-
-
-def _windows(slow: Source, fast: Source, length_s: float) -> Stamps:
-    """Windows (M, 2) ns between stamps of the slow source; whatever the delay, neither pauses."""
-    edges = slow.stamps_ns[:: int(np.ceil(length_s / slow.period_s))]
-    windows = np.column_stack([edges[:-1], edges[1:]])
-    reach = round(CLOCK_RANGE_S * 1e9)
-    for source, margin in ((slow, 0), (fast, reach)):
-        pause_s = max(_PAUSE_S, 3 * source.period_s)
-        begin = windows[:, 0] - margin
-        end = windows[:, 1] + margin
-        windows = windows[without_pause(begin, end, source.stamps_ns, pause_s)]
-    return windows[:: len(windows) // _WINDOWS_MAX + 1]
-
-
-def typical(x: Array) -> float:
-    """The step of x (N,) so that half of the motion is in steps as large, or larger ones: standing
-    does not count.
-    """
-    return quantile(np.abs(x), 0.5, np.abs(x))
-
-
-def _regressed(what: str, a: Source, b: Source, x: Array, y: Array) -> Pair | None:
-    """The best of D delays, of the motion x (D, M) of `a` and y (D, M) of `b` in M windows."""
-    middle = len(GRID) // 2
-    # Noise adds up while nothing moves, and that of images may be large.
-    steps = [np.abs(s[middle]) for s, source in ((x, a), (y, b)) if source.name != IMAGES]
-    if max(s[s > _STEP / 2].sum() for s in steps) < ENOUGH[what]:
-        return None
-    limit = np.array([typical(x[middle]), typical(y[middle])])
-    # Shifts between images may err by any angle.
-    limit = np.minimum(limit, 2 * limit[::-1]) if IMAGES in (a.name, b.name) else limit
-    u, v = (np.clip(s, -FAR * q, FAR * q) for s, q in zip((x, y), limit, strict=True))
-    best, correlation, scale, moves = _best_delay(x, y, u, v, limit)
-    period_s = max(source.period_s for source in (a, b) if source.name != IMAGES)
-    delay_s = _certain_delay(correlation, best, moves)
-    return Pair(what, a.name, b.name, scale, delay_s, float(correlation[best]), period_s)
-
-
-def _best_delay(
-    x: Array, y: Array, u: Array, v: Array, limit: Array
-) -> tuple[int, Array, float, int]:
-    """The row at which motions (D, M), clipped to u and v, correlate best, the correlations (D,),
-    the scale there, and how many windows move; `limit` (2,) are the typical steps.
-    """
-    inlier = np.ones(x.shape[1], bool)
-    for _ in range(2):
-        power = (u[:, inlier] ** 2).sum(1) * (v[:, inlier] ** 2).sum(1)
-        correlation = np.abs((u * v)[:, inlier].sum(1)) / np.sqrt(np.maximum(power, 1e-30))
-        best = int(np.argmax(correlation - 1e-6 * np.abs(GRID)))
-        # The least sum of |y - scale x|.
-        ratio = y[best] / np.where(x[best] == 0, 1.0, x[best])
-        scale = quantile(ratio[inlier], 0.5, np.abs(x[best, inlier]))
-        residual = np.abs(y[best] - scale * x[best])
-        moves = np.abs(u[best]) > limit[0] / 4
-        std = MEDIAN_TO_STD * float(np.median(residual[moves])) if moves.any() else np.inf
-        inlier = residual <= max(FAR * std, limit[1] / 2)
-    return best, correlation, scale, int(moves.sum())
-
-
-def _certain_delay(correlation: Array, best: int, moves: int) -> float | None:
-    """The delay of the best correlation (D,), s; None where others fit as well."""
-    # Delays whose correlation is within one standard deviation of the best.
-    chance = (1 - correlation[best] ** 2) / np.sqrt(max(moves, 1))
-    as_good = GRID[correlation >= correlation[best] - chance - 1e-3]
-    if not 0 < best < len(GRID) - 1 or np.ptp(as_good) / 4 >= _STD_MAX_S:
-        return None
-    peak = float(parabola_peak(*correlation[best - 1 : best + 2]))
-    return float(GRID[best] + peak * (GRID[1] - GRID[0]))
 
 
 def compare_map(odometry: Odometry, stamps_ns: Stamps, poses: Array) -> Pair | None:
