@@ -40,7 +40,7 @@ from sfa_localization.motion.sources import (
     Source,
 )
 
-DELAYS_S = np.linspace(-CLOCK_RANGE_S, CLOCK_RANGE_S, 101)
+DELAYS_S = np.linspace(-CLOCK_RANGE_S, CLOCK_RANGE_S, 51)
 """Those that are searched."""
 FAR = 3.0
 """Steps beyond so many times the typical one are clipped, and errors beyond so many standard
@@ -64,7 +64,7 @@ _WINDOWS_MAX = 1000
 _PAUSE_S = 1.0
 # First steps around the best of the grid, s, and that of its rates over the whole drive.
 _STEP_S = 0.02
-_RATE_STEP_S = 0.2
+_RATE_STEP_S = 0.3
 # Neighboring windows err alike.
 _ALIKE_WINDOWS = 3
 # Models of a camera that follows: lag, s, largest rate, rad/s, and turn that it ignores, rad.
