@@ -25,7 +25,7 @@ COMMANDS = (
     'config',
     'demo',
 )
-NODES = ('omnicam_node', 'sfa_node', 'ekf_node', 'localization')
+NODES = ('omnicam_node', 'sfa_node', 'ekf_node', 'localization', 'teach_node')
 # colcon runs `setup.py install` or `develop`, and setup.cfg puts the executables into
 # lib/sfa_localization, for `ros2 run sfa_localization train`. pip builds a wheel instead, whose
 # executables are on the PATH: it gets the nodes and one command, no `train`, `filter` or `config`.

@@ -34,6 +34,7 @@ from sfa_localization.nodes.settings import (
     NodeConfig,
     OmnicamNodeConfig,
     SfaNodeConfig,
+    TeachNodeConfig,
 )
 from sfa_localization.sfa.settings import NetworkConfig
 
@@ -42,6 +43,7 @@ SECTIONS: dict[str, tuple[type[Settings], ...]] = {
     'omnicam_node': (NodeConfig, OmnicamNodeConfig, CaptureConfig, CameraConfig, PanoramaConfig),
     'sfa_node': (NodeConfig, SfaNodeConfig, WatchConfig),
     'ekf_node': (NodeConfig, EkfNodeConfig, FilterConfig),
+    'teach_node': (NodeConfig, TeachNodeConfig, TopicNames),
     'training': (TopicNames, BagConfig, NetworkConfig, SegmentConfig, MetricConfig),
 }
 """The settings of each section; the trainer reads camera and panorama from omnicam_node."""

@@ -221,6 +221,7 @@ class BagReport:
             'motion': self.motion.as_dict() if self.motion else None,
             'enough_to_train_on': not (self.lacks or self.error),
             'lacks': self.lacks,
+            'drives': [drive.round(3).tolist() for drive in self.drives],
         }
 
     def as_text(self) -> str:

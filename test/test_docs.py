@@ -59,7 +59,7 @@ FOREIGN = {
     'pip',
     'sudo',
 }
-FOREIGN_ROS = {'run robot_localization', 'launch nav2_bringup', 'bag record', 'topic echo'}
+FOREIGN_ROS = {'run robot_localization', 'launch nav2_bringup', 'bag record', 'topic echo', 'service call'}
 
 
 def test_every_command_exists():
@@ -165,16 +165,17 @@ def test_links_and_topics_exist():
 
 
 @pytest.mark.ros
-def test_the_table_of_topics_is_that_of_the_nodes(bench, monkeypatch):
+def test_the_table_of_topics_is_that_of_the_nodes(bench, monkeypatch, tmp_path):
     from ros_bench import until
 
-    from sfa_localization.nodes import ekf_node, omnicam_node, sfa_node
+    from sfa_localization.nodes import ekf_node, omnicam_node, sfa_node, teach_node
 
     load_pictures(monkeypatch)
     nodes = [
         bench.run(omnicam_node.OmnicamNode, level_by_imu=True),
         bench.run(sfa_node.SfaNode, model='model.npz'),
         bench.run(ekf_node.EkfNode),
+        bench.run(teach_node.TeachNode, output=str(tmp_path / 'garden.npz')),
     ]
 
     def topics_of(entities):

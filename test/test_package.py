@@ -43,7 +43,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'sfa': ({'data', 'camera', 'keyframes'}, NUMERIC | {'cv2', 'mdp'}),
     'keyframes': ({'data', 'camera'}, NUMERIC | {'cv2'}),
     'fusion': ({'data'}, NUMERIC | {'filterpy'}),
-    'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'mcap', 'lz4', 'zstandard'}),
+    'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'mcap', 'lz4', 'zstandard', 'yaml'}),
     'motion': ({'data', 'keyframes'}, NUMERIC),
     'metric': ({'data', 'keyframes', 'motion'}, NUMERIC),
     'mapping': ({'data', 'sfa', 'keyframes', 'motion', 'metric'}, NUMERIC),
@@ -60,7 +60,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'filtering': ({'data', 'fusion'}, {'numpy'}),
     'reports': ({'data', 'camera', 'training', 'inspection'} | METHOD, {'numpy', 'matplotlib'}),
     'nodes': (
-        {'data', 'camera', 'fusion', 'mapping', 'place_model', 'observer', 'config'},
+        {'data', 'camera', 'fusion', 'bags', 'mapping', 'place_model', 'observer', 'config'},
         {'numpy', 'yaml', 'nav2_msgs'} | ROS,  # nav2_msgs where it is installed
     ),
     'config': (CORE | {'nodes'}, {'yaml'}),

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import Delaunay, QhullError
 
 from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.mapping.settings import GroundConfig
@@ -35,6 +36,15 @@ class Cells:
     def area_m2(self) -> float:
         """Area of the cells on which the robot drove."""
         return float(self.driven.sum() * self.size_m**2)
+
+    def enclosed(self, places: Array) -> Mask:
+        """The cells (H, W) inside the convex hull of places (P, 2) m."""
+        row, column = np.indices(self.driven.shape)
+        centers = self.corner + self.size_m * (np.stack([column, row], axis=-1) + 0.5)
+        try:
+            return np.asarray(Delaunay(places).find_simplex(centers) >= 0)
+        except (QhullError, ValueError):  # too few places, or all on a line
+            return np.zeros(self.driven.shape, bool)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ import array
 import dataclasses
 import json
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data import messages
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError, MessageError
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Mask
 from sfa_localization.data.messages import NANOSECONDS, read_stamp, require_sane
 from sfa_localization.data.rig import Rig
 from sfa_localization.data.run import Image
@@ -40,6 +41,9 @@ _FIXED = np.diag([1e-6] * 6)
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _TWIST = np.ix_([0, 5], [0, 5])
 _CORRELATION = 'error_correlation'
+_OCCUPIED = 100
+_TEXT_M = 0.4
+_TEXT_UP_M = 1.0
 _RED_M = 0.3
 _LINE_M = 0.05
 """The expected error that is drawn red, and the width of the lines."""
@@ -179,14 +183,38 @@ def read_turned(message: geometry.QuaternionStamped) -> tuple[int, float]:
     return read_stamp(message.header.stamp), messages.read_yaw(message.quaternion)
 
 
-def to_grid(cells: Cells, stamp_ns: int, frame: str) -> OccupancyGrid:
-    """Cells as a map: free where the robot drove, else unknown."""
+def to_grid(cells: Cells, stamp_ns: int, frame: str, to_drive: Mask | None = None) -> OccupancyGrid:
+    """Cells as a map: free where the robot drove, occupied where it is `to_drive` still, else
+    unknown.
+    """
     info = MapMetaData(map_load_time=to_stamp(stamp_ns), resolution=cells.size_m)
     info.height, info.width = cells.driven.shape
     info.origin.position.x, info.origin.position.y = cells.corner.tolist()
     values = np.where(cells.driven, 0, -1).astype(np.int8)
+    if to_drive is not None:
+        values[to_drive & ~cells.driven] = _OCCUPIED
     data = array.array('b', values.tobytes())
     return OccupancyGrid(header=_header(stamp_ns, frame), info=info, data=data)
+
+
+def to_hints(drives: Sequence[Array], text: str, stamp_ns: int, frame: str) -> MarkerArray:
+    """The places (M, 3) of images of each part of a drive as lines, and a sentence at the last."""
+    markers = []
+    for number, places in enumerate(drives):
+        line = Marker(header=_header(stamp_ns, frame), ns='drive', type=Marker.LINE_STRIP)
+        line.id = number
+        line.scale.x = _LINE_M
+        line.pose.orientation.w = 1.0
+        line.color = ColorRGBA(g=1.0, a=1.0)
+        line.points = [geometry.Point(x=x, y=y) for x, y in places[:, :2].tolist()]
+        markers.append(line)
+    said = Marker(header=_header(stamp_ns, frame), ns='said', type=Marker.TEXT_VIEW_FACING)
+    said.pose.position.x, said.pose.position.y = drives[-1][-1, :2].tolist()
+    said.pose.position.z = _TEXT_UP_M
+    said.scale.z = _TEXT_M
+    said.color = ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0)
+    said.text = text
+    return MarkerArray(markers=[*markers, said])
 
 
 def to_lines(ground: DrivenGround, stamp_ns: int, frame: str) -> MarkerArray:

@@ -14,7 +14,7 @@ from sfa_localization.nodes.process import NODES
 PATIENCE_S = 3.0
 """Time before another topic is taken: drivers of cameras and wheels may start after this node."""
 _TRANSPORT = re.compile('/(compressed|ffmpeg|foxglove)$')
-_DEPTH = '/compressedDepth'
+DEPTH = '/compressedDepth'
 _OUTPUTS = '/ekf/odometry', '/panorama', '/panorama/compressed'
 """Odometry and images of this package's nodes, which a bag may hold: never an input."""
 
@@ -22,6 +22,18 @@ _OUTPUTS = '/ekf/odometry', '/panorama', '/panorama/compressed'
 def without_transport(topic: str) -> str:
     """The name of an image topic without that of its transport, as image_transport names it."""
     return _TRANSPORT.sub('', topic)
+
+
+def is_output(node: Any, name: str) -> bool:
+    """Whether a node of this package publishes a topic, as the other `node` sees it."""
+    ours = {other for other, _ in _publishers(node, name)} & {*NODES, node.get_name()}
+    return bool(ours) or name.endswith(_OUTPUTS)
+
+
+def _publishers(node: Any, name: str) -> set[tuple[str, str]]:
+    """Names and namespaces of the nodes that publish a topic."""
+    infos = node.get_publishers_info_by_topic(name)
+    return {(info.node_name, info.node_namespace) for info in infos}
 
 
 class Discovery:
@@ -115,13 +127,11 @@ class Discovery:
         spaces = {f'{space}/' for _, space in self._node.get_node_names_and_namespaces()}
         others = tuple(space for space in spaces if len(space) > len(below))
         usual = name.startswith(below) and not name.startswith(others)
-        is_image = not name.endswith(_DEPTH)
+        is_image = not name.endswith(DEPTH)
         return usual and is_image and not self._is_output(name)
 
     def _is_output(self, name: str) -> bool:
-        ours = {node for node, _ in self._publishers(name)} & {*NODES, self._node.get_name()}
-        return bool(ours) or name.endswith(_OUTPUTS)
+        return is_output(self._node, name)
 
     def _publishers(self, name: str) -> set[tuple[str, str]]:
-        infos = self._node.get_publishers_info_by_topic(name)
-        return {(info.node_name, info.node_namespace) for info in infos}
+        return _publishers(self._node, name)

@@ -36,7 +36,9 @@ def run(name: str, words: Sequence[str] | None = None) -> int:
     return int(lifecycle.run_nodes(lambda: [kind()], words))
 
 
-omnicam_node, sfa_node, ekf_node, localization = (partial(run, name) for name in EXECUTABLES)
+omnicam_node, sfa_node, ekf_node, localization, teach_node = (
+    partial(run, name) for name in EXECUTABLES
+)
 
 
 def node_help(name: str) -> str:

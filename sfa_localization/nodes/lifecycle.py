@@ -143,12 +143,13 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         qos: QoSProfile,
         substitute: str = '',
         entity: str | None = None,
+        raw: bool = False,
     ) -> Any:
         """A subscription that counts messages, and those which `callback` rejects, under `topic`.
 
         An inactive node drops messages, except latched ones, which come only once. The topic
         `substitute`, if given, is subscribed to in place of `topic`. Subscriptions of another
-        `entity` have their own qos_overrides.
+        `entity` have their own qos_overrides. A `raw` one hands over messages as bytes.
         """
         latched = qos.durability is DurabilityPolicy.TRANSIENT_LOCAL
         self.require_input(topic, substitute)
@@ -163,6 +164,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             cast(Any, receive),
             qos,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(entity_id=entity),
+            raw=raw,
         )
         self._entities[subscription] = self.destroy_subscription
         return subscription
@@ -225,6 +227,16 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
         service = self.create_service(kind, name, answer)
         self._entities[service] = self.destroy_service
+
+    def client(self, kind: Any, name: str) -> Any:
+        """A client of a service, one for each name."""
+        full_name = self.resolve_service_name(name)
+        for client in self.clients:
+            if client.srv_name == full_name:
+                return client
+        client = self.create_client(kind, name)
+        self._entities[client] = self.destroy_client
+        return client
 
     def order(self, kind: Any, name: str, callback: Callable[[Any], None]) -> None:
         """A service with an empty answer: a request is counted, and rejected, as a message is."""

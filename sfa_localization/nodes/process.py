@@ -13,7 +13,12 @@ NODES = {
 }
 COMPOSED = 'localization'
 """The executable that runs all of them in one process."""
-EXECUTABLES = {**NODES, COMPOSED: 'All three nodes in one process, with their parameters.'}
+TEACH = 'teach_node'
+EXECUTABLES = {
+    **NODES,
+    COMPOSED: 'All three nodes in one process, with their parameters.',
+    TEACH: 'ROS 2 node: records a drive, says where to drive still, and trains on it.',
+}
 CANNOT_START = 1
 DIED = 2
 """Exit codes: a launch ends if a node cannot start, and restarts a node that died."""

@@ -38,6 +38,23 @@ class OmnicamNodeConfig(Settings):
 
 
 @dataclass(frozen=True, slots=True)
+class TeachNodeConfig(Settings):
+    """teach_node: a drive in, a model out."""
+
+    output: str = setting(
+        '', 'model to write, GARDEN.npz; drives are recorded into GARDEN_drive1 and so on beside it'
+    )
+    localize: bool = setting(
+        False, 'configure and activate omnicam_node, sfa_node and ekf_node when a model is written'
+    )
+    odom_frame: str = setting('odom', 'frame of teach/map and teach/hints')
+    share: float = setting(
+        0.2, 'share of a core for looking at the drive while it is driven', low=0.01, high=1.0,
+        live=True,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
 class SfaNodeConfig(Settings):
     """sfa_node: panorama in, slow features and pose out."""
 

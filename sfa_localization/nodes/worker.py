@@ -1,0 +1,61 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""A command of this package in a process of its own, at low priority."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from sfa_localization.nodes.monitor import steady_s
+
+_NICE = 10
+_STOP_S = 5.0
+_LAST_BYTES = 2000
+
+
+class Worker:
+    """Runs a command, as of the command line; its output goes to the file `log`."""
+
+    def __init__(self, words: Sequence[str | Path], log: Path) -> None:
+        self.start_s = steady_s()
+        self._log = log
+        command = [sys.executable, '-m', 'sfa_localization', *map(str, words)]
+        with log.open('wb') as output:
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )  # fmt: skip
+        with suppress(OSError):  # it may have ended
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICE)
+
+    @property
+    def code(self) -> int | None:
+        """Its exit code; None while it runs."""
+        return self._process.poll()
+
+    @property
+    def elapsed_s(self) -> float:
+        """How long it has been running."""
+        return steady_s() - self.start_s
+
+    def last_line(self) -> str:
+        """What it printed last; progress bars return to the start of their line."""
+        text = self._log.read_bytes()[-_LAST_BYTES:].decode(errors='replace')
+        lines = [line.strip() for line in text.replace('\r', '\n').split('\n')]
+        return next(filter(None, reversed(lines)), '')
+
+    def stop(self) -> None:
+        """End it, as a terminal does; what it wrote stays whole."""
+        if self.code is not None:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()

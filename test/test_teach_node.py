@@ -1,0 +1,181 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Teach and go: a drive through DDS is recorded, judged as `inspect` does, and learned."""
+
+import errno
+import os
+from unittest import mock
+
+import pytest
+from page_tables import ROOT
+
+from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.recorder import BagRecorder
+from sfa_localization.data.errors import BagError
+from sfa_localization.inspection import inspect
+from sfa_localization.place_model import PlaceModel
+
+pytest.importorskip('rclpy')
+
+from nav_msgs.msg import OccupancyGrid, Odometry
+from rclpy.serialization import deserialize_message
+from ros_bench import until
+from sensor_msgs.msg import CompressedImage, Imu
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+from sfa_localization.nodes.ekf_node import EkfNode
+from sfa_localization.nodes.lifecycle import latched_qos
+from sfa_localization.nodes.omnicam_node import OmnicamNode
+from sfa_localization.nodes.sfa_node import SfaNode
+from sfa_localization.nodes.teach_node import TeachNode
+
+pytestmark = pytest.mark.ros
+KINDS = {'/odom': Odometry, '/imu': Imu, '/panorama_raw/compressed': CompressedImage}
+SAMPLE = ROOT / 'bags/sample'
+
+
+def records(path, *topics):
+    """Topic, type, bytes and time of the messages of a bag."""
+    with Bag(path) as bag:
+        assert bag.problems == []
+        return [
+            (topic.name, topic.kind, bytes(data), at_ns)
+            for topic, at_ns, data in bag.recording.messages(topics or [*bag.topics])
+        ]
+
+
+def test_a_recorded_bag_holds_the_same_messages_also_after_it_went_on(tmp_path):
+    messages = records(SAMPLE)[:500]
+    folder = tmp_path / 'drive'
+    first = BagRecorder(folder)
+    for message in messages[:300]:
+        first.write(*message)
+    first.flush()  # and the power fails
+    assert len([*folder.glob('*.mcap')]) == 1
+    with Bag(folder) as bag:
+        assert sum(topic.count for topic in bag.topics.values()) == 300
+    second = BagRecorder(folder)
+    for message in messages[300:]:
+        second.write(*message)
+    second.close()
+    assert len([*folder.glob('*.mcap')]) == 2 and not (folder / 'metadata.yaml').exists()
+    with Bag(folder) as bag:
+        read = [bytes(data) for *_, data in bag.recording.messages([*bag.topics])]
+    assert read == [data for _, _, data, _ in messages]
+
+
+def test_a_bag_in_one_file_has_its_metadata(tmp_path):
+    messages = records(SAMPLE)[:500]
+    recorder = BagRecorder(tmp_path / 'drive')
+    for message in messages:
+        recorder.write(*message)
+    recorder.close()
+    assert records(tmp_path / 'drive') == messages
+    assert (tmp_path / 'drive/metadata.yaml').exists()
+
+
+def test_a_full_disk_names_the_bag_and_the_reason(tmp_path, monkeypatch):
+    recorder = BagRecorder(tmp_path / 'drive')
+    recorder.write(*records(SAMPLE)[0])
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(recorder._writer, 'flush', mock.Mock(side_effect=full))
+    with pytest.raises(BagError, match='drive: cannot be written: No space left on device'):
+        recorder.flush()
+
+
+@pytest.fixture
+def taught(bench, tmp_path):
+    output = str(tmp_path / 'garden.npz')
+    return bench.run(TeachNode, output=output, share=1.0, localize=True)
+
+
+@pytest.fixture
+def chain(bench, tmp_path):
+    """The three nodes, which wait for a model."""
+    images = ['--ros-args', '-r', 'image_raw/compressed:=/panorama_raw/compressed']
+    model = str(tmp_path / 'garden.npz')
+    waiting = {'autostart': False}
+    options = {'cli_args': images}
+    return [
+        bench.run(
+            OmnicamNode, options=options, image_transport='compressed', model=model, **waiting
+        ),
+        bench.run(SfaNode, model=model, **waiting),
+        bench.run(EkfNode, **waiting),
+    ]
+
+
+def call(bench, name):
+    return bench.call(Trigger, f'teach_node/{name}', Trigger.Request())
+
+
+def driver(bench, counted):
+    """Sends recorded messages through DDS, as fast as they are counted."""
+    create = bench.node.create_publisher
+    topics = {topic: create(kind, topic, 1000) for topic, kind in KINDS.items()}
+    assert until(lambda: all(each.get_subscription_count() for each in topics.values()))
+
+    def drive(messages):
+        before = counted()
+        for number, (topic, _, data, _) in enumerate(messages, before + 1):
+            topic = '/panorama_raw/compressed' if topic.startswith('/panorama') else topic
+            topics[topic].publish(deserialize_message(data, KINDS[topic]))
+            assert until(lambda: counted() > number - 40)  # noqa: B023
+        assert until(lambda: counted() == before + len(messages))
+
+    return drive
+
+
+def test_a_drive_is_taught_and_learned(bench, chain, taught, tmp_path):
+    said = bench.listen(String, 'teach/state', latched_qos())
+    grids = bench.listen(OccupancyGrid, 'teach/map', latched_qos())
+    hints = bench.listen(MarkerArray, 'teach/hints', latched_qos())
+    messages = records(SAMPLE, '/odom', '/imu', '/panorama/compressed')
+    third = len(messages) // 3
+    drive = driver(bench, taught._recorder.counts.total)
+    drive(messages[:third])
+    assert until(lambda: 'not' in taught._said or 'few' in taught._said), taught._said
+    drive(messages[third:])
+    assert until(lambda: any('enough to train on' in each.data for each in said)), taught._said
+    assert 0 in grids[-1].data and hints[-1].markers[-1].text.startswith('enough')
+    assert call(bench, 'finish').success
+    assert until(lambda: 'is written' in said[-1].data, 300.0), said[-1].data
+    report = inspect(tmp_path / 'garden_drive1')
+    assert report.lacks == [] and report.problems == []
+    assert {name: topic.count for name, topic in ((t.name, t) for t in report.topics)} == {
+        '/odom': 3176, '/imu': 3176, '/panorama_raw/compressed': 427,
+    }  # fmt: skip
+    model = PlaceModel.load(tmp_path / 'garden.npz')
+    assert model.quality['certified']
+    answer = call(bench, 'finish')
+    assert not answer.success and '~/extend' in answer.message
+    assert until(lambda: all(node.active for node in chain))
+    located = bench.listen(String, 'ekf/state', latched_qos())
+    inputs = [chain[2].monitors['odom'], chain[0].monitors['image_raw/compressed']]
+    localize(bench, inputs, located)
+    assert call(bench, 'extend').success and taught._recorder.folder.name == 'garden_drive2'
+    assert call(bench, 'cancel').success
+
+
+def localize(bench, inputs, located):
+    """The test drive, until the robot is localised: within two meters of driving and a turn."""
+    sent = {each.topic_name: each for each in bench.node.publishers}
+    messages = records(ROOT / 'bags/sample_test', '/odom', '/panorama/compressed')
+    for topic, _, data, _ in messages:
+        topic = '/panorama_raw/compressed' if topic.startswith('/panorama') else topic
+        monitor = inputs[topic != '/odom']
+        due = monitor.received + 1
+        sent[topic].publish(deserialize_message(data, KINDS[topic]))
+        assert until(lambda: monitor.received >= due)  # noqa: B023
+        if located and located[-1].data == 'LOCALISED':
+            return
+    assert until(lambda: located[-1].data == 'LOCALISED', 5.0), located[-1].data
+
+
+def test_a_name_is_needed_and_nothing_is_finished_before_it_began(bench, taught):
+    answer = call(bench, 'finish')
+    assert not answer.success and 'nothing was recorded yet' in answer.message
+    node = bench.run(TeachNode, start=False, options={'namespace': 'other'})
+    assert not node.start() and "parameter 'output' is empty" in node.failure
