@@ -145,6 +145,16 @@ def test_pages_are_of_the_version_and_date_of_the_recorded_results():
         assert f'<!-- {name} -->\n{text}<!-- end -->' in evaluation, name
 
 
+def test_the_page_names_the_speeds_above_what_is_allowed():
+    """And none that are not."""
+    block = PAGES['test/README.md'].split('<!-- bench -->')[1].split('<!-- end -->')[0]
+    rows = [[cell.strip() for cell in line.split('|')[1:-1]] for line in block.splitlines()[3:]]
+    rows = [row for row in rows if row and row[1] and row[3]]
+    above = [what for what, now, _, allowed in rows if float(now) > float(allowed)]
+    assert len(rows) > 5
+    assert f'\nMore than allowed: {"; ".join(above) or "nothing"}.\n' in block
+
+
 def test_the_evaluation_is_short():
     """Eight columns and 2,300 words at most, marks of tables included, as `wc -w` counts."""
     rulers = re.findall(r'^\|(?:[ :-]+\|)+$', PAGES[EVALUATION], re.MULTILINE)
