@@ -16,7 +16,7 @@ import setuptools
 from page_tables import ROOT
 
 import sfa_localization
-from sfa_localization import cli
+from sfa_localization import cli, training
 from sfa_localization.cli import COMMANDS, EXECUTABLES
 from sfa_localization.nodes.process import NODES
 
@@ -309,3 +309,9 @@ def test_ctrl_c_while_a_command_is_imported_prints_a_line(monkeypatch, capsys):
         monkeypatch.setattr(cli.importlib, 'import_module', mock.Mock(side_effect=error))
         assert cli.main(words) == 130
         assert capsys.readouterr().err == 'interrupted\n'
+
+
+def test_a_training_that_is_interrupted_says_how_to_go_on(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(training, 'train', mock.Mock(side_effect=KeyboardInterrupt))
+    assert cli.main(['train', 'bag', '--output', str(tmp_path / 'model.npz')]) == 130
+    assert capsys.readouterr().err.startswith('interrupted: the same command with --resume')

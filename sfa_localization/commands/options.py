@@ -18,9 +18,11 @@ from sfa_localization.data.files import first_bytes, require_outputs, resolved
 from sfa_localization.data.settings import Settings
 
 if TYPE_CHECKING:
+    from sfa_localization.bags.drives import ReadingRecipe
     from sfa_localization.training import Recipe
 
 S = TypeVar('S', bound=Settings)
+R = TypeVar('R', bound='ReadingRecipe')
 TOPIC_OPTIONS = {
     'image': '--image-topic',
     'odometry': '--odom-topic',
@@ -143,13 +145,18 @@ def recipe(arguments: argparse.Namespace) -> Recipe:
     """Return the training recipe of --config and of the command line."""
     from sfa_localization.training import Recipe
 
-    default = Recipe()
-    chosen = {}
-    for item in dataclasses.fields(Recipe):
+    return recipe_of(Recipe, arguments)
+
+
+def recipe_of(kind: type[R], arguments: argparse.Namespace) -> R:
+    """Return a recipe whose groups of settings are those of --config and of the command line."""
+    default = kind()
+    chosen: dict[str, Any] = {}
+    for item in dataclasses.fields(kind):
         group = getattr(default, item.name)
         if isinstance(group, Settings):
             chosen[item.name] = settings(type(group), arguments)
-    return Recipe(**chosen)  # type: ignore[arg-type]
+    return kind(**chosen)
 
 
 def require_same_panorama(path: Path | None, trained: PanoramaConfig) -> None:
