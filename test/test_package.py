@@ -3,6 +3,7 @@
 """The package as a whole: imports between rooms, one version, what is installed, exit codes."""
 
 import ast
+import re
 import runpy
 import subprocess
 import sys
@@ -218,6 +219,14 @@ def test_pip_installs_a_command_and_the_nodes_and_colcon_all_commands():
         commands = set(COMMANDS) if command in ('install', 'develop') else set()
         assert executables == {NAME, *EXECUTABLES, *commands}
         assert not [name for name in arguments['packages'] if 'test' in name or 'study' in name]
+
+
+def test_the_environment_of_the_tests_has_all_extras():
+    """So that no test is skipped but those of a ROS installation."""
+    needed = set(setup_arguments()['extras_require']) - {'ros', 'kilted'}
+    script = (ROOT / '.ci/env').read_text('utf-8')
+    for line in re.findall(r'extras=(\S+)', script):
+        assert needed <= set(line.split(','))
 
 
 MAIN = 'from sfa_localization import cli\ntry: cli.main({})\nexcept SystemExit: pass'
