@@ -5,6 +5,7 @@
 import base64
 import html
 import itertools
+import logging
 import re
 from dataclasses import replace
 from types import SimpleNamespace
@@ -19,10 +20,12 @@ from test_inspection import write as write_drive
 
 from sfa_localization.bags.drives import images_at
 from sfa_localization.cli import main
+from sfa_localization.commands.options import noticed
 from sfa_localization.data.run import Trajectory
 from sfa_localization.reports import evaluation, page, training
 
 FOREIGN = re.compile(r'<(script|link|iframe)|href=|srcset=|onload=|onclick=|url\(|@import')
+PREFIX = re.compile('^(note|problem|corrected|not enough to train on|error|together not enough): ')
 IMAGE = re.compile(r'<img[^>]* src="data:image/png;base64,([^"]+)"[^>]*>')
 
 
@@ -83,11 +86,35 @@ def test_the_answer_about_a_map_follows_its_figures(reported):
         grade, sentence = training.judgment(changed)
         assert grade == level and why in sentence
         assert training.trust_lines(changed)[0].startswith('NOT proven') != quality['certified']
+        told = training.summary(changed)
+        assert ('position: expect' in told) == (why != 'show'), 'no error of a useless map'
     sparse = replace(result.metric, poses=5 * result.metric.poses)
     assert 'm apart' in training.judgment(replace(result, metric=sparse))[1]
     places = result.metric.poses[:, :2]
     near, far = (' '.join(training.advice(result, k * places)) for k in (1, 30))
     assert 'drive lanes 2 m apart' in far and 'lanes' not in near
+
+
+def test_a_useless_map_has_no_weak_places(reported, tmp_path):
+    result, _, _ = reported
+    useless = replace(result, model=replace(result.model, quality={**result.model.quality,
+                                                                   'explained': 0.3}))  # fmt: skip
+    warnings = ['drive: the camera leans <by> 7 degrees', training.summary(useless).splitlines()[1]]
+    training.write_training_report(tmp_path, useless, warnings=warnings)
+    content = read(tmp_path)
+    assert 'The map cannot be used' in content.text and 'Where is it weak?' not in content.headings
+    assert 'expect' not in content.text.split('What do I drive next?')[0]
+    assert page.NOTICED in content.headings and content.text.count(warnings[0]) == 1
+    assert content.text.count(warnings[1]) == 1, 'not twice'
+
+
+def test_what_is_warned_of_is_kept_and_printed_once(capsys):
+    logger = logging.getLogger('sfa_localization.test')
+    with noticed() as outer, noticed() as warnings:
+        logger.warning('%s leans', 'it')
+        logger.info('a lens')
+    logger.warning('later')
+    assert outer == warnings == ['it leans']
 
 
 @pytest.fixture
@@ -150,16 +177,25 @@ def test_the_answer_about_a_drive_follows_its_figures(judged):
         assert words in text and (grade == page.GOOD) == (ratio < 2)
 
 
-def test_the_page_of_an_inspection(tmp_path):
-    """And of a bag that cannot be read."""
-    write_drive(tmp_path / 'few', pictures=100)
+def test_the_page_of_an_inspection(tmp_path, capsys):
+    """And of a bag that cannot be read; it says all that the terminal says."""
+    robot = (4, 10, 25, 40)
+    write_drive(tmp_path / 'few', pictures=100, shape=(12, 60), body=[robot])
     words = ['inspect', str(tmp_path / 'few'), str(tmp_path / 'none')]
     assert main([*words, '--report', str(tmp_path / 'report')]) == 1
     content = read(tmp_path / 'report')
+    told = capsys.readouterr()
+    assert 'shows the robot' in told.out and 'compared  ' in told.out
+    for line in f'{told.err}{told.out}'.splitlines()[:-1]:  # the last names the page
+        line = PREFIX.sub('', line.strip())
+        for cell in re.split(r'  +| \(\w+\): | messages, | Hz$', line):
+            assert cell.removeprefix(f'{tmp_path}/') in content.text, line
     for name in ('few', 'none'):
         assert f'{name} is not enough to train on yet.' in content.text
     assert '100 images with odometry are few: drive until there are 300' in content.text
-    assert content.headings[:2] == ['What do I drive or change next?', 'What is in it?']
+    assert content.headings[:3] == [
+        'Are they enough together?', 'What do I drive or change next?', 'What is in it?'
+    ]  # fmt: skip
     assert len(content.images) == 2
 
 

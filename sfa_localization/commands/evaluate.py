@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -69,34 +70,38 @@ def run(arguments: argparse.Namespace) -> int:
     options.require_report(arguments.report, arguments.json)
     model = PlaceModel.load(arguments.model)
     options.require_same_panorama(arguments.config, model.panorama)
-    if transform is not None and not model.quality.get('points'):
-        logger.warning(
-            '%s: its map has no measured points, so that its coordinates are its own: train with '
-            '--points or --points-topic, or evaluate with --align TRAIN_BAG', arguments.model,
-        )  # fmt: skip
-    result = evaluation.evaluate(
-        model,
-        arguments.bag,
-        align_bags=align,
-        recipe=options.recipe(arguments),
-        config=options.settings(FilterConfig, arguments),
-        watch=options.settings(WatchConfig, arguments),
-        progress=True,
-        smooth=arguments.smooth,
-        transform=transform,
-    )
+    with options.noticed() as warnings:
+        if transform is not None and not model.quality.get('points'):
+            logger.warning(
+                '%s: its map has no measured points, so that its coordinates are its own: train '
+                'with --points or --points-topic, or evaluate with --align TRAIN_BAG',
+                arguments.model,
+            )
+        result = evaluation.evaluate(
+            model,
+            arguments.bag,
+            align_bags=align,
+            recipe=options.recipe(arguments),
+            config=options.settings(FilterConfig, arguments),
+            watch=options.settings(WatchConfig, arguments),
+            progress=True,
+            smooth=arguments.smooth,
+            transform=transform,
+        )
     print(tables(result.scores), *trust_lines(result.scores), sep='\n')
     print(*count_lines(result.counts), sep='\n')
     print(f'aligned on {result.aligned_on}', *result.corrections, sep='\n')
-    if arguments.report:
-        _write_report(arguments, result)
     if arguments.json:
         grade, sentence = judgment(result.scores, result.counts)
         write_json(arguments.json, {**result.as_dict(), 'grade': grade, 'sentence': sentence})
+    if arguments.report:
+        _write_report(arguments, result, warnings)
     return 0
 
 
-def _write_report(arguments: argparse.Namespace, result: Evaluation) -> None:
+def _write_report(
+    arguments: argparse.Namespace, result: Evaluation, warnings: Sequence[str]
+) -> None:
     """Write figures and the page; the worst images are read from the bag again."""
     from sfa_localization.bags.drives import images_at
     from sfa_localization.reports.evaluation import worst_of, write_evaluation_page, write_report
@@ -112,6 +117,6 @@ def _write_report(arguments: argparse.Namespace, result: Evaluation) -> None:
     read = images_at(arguments.bag, stamps.values(), options.recipe(arguments))
     samples = {image: read[stamp] for image, stamp in stamps.items() if stamp in read}
     title = f'{arguments.model.name} on {arguments.bag.name}'
-    notes = f'The map is aligned on {result.aligned_on}.', *result.corrections
+    notes = f'The map is aligned on {result.aligned_on}.', *result.corrections, *warnings
     write_evaluation_page(folder, title, *drive, result.counts, samples, notes)
     print(f'{folder / PAGE}: written')

@@ -59,29 +59,29 @@ def run(arguments: argparse.Namespace) -> int:
     lacks = lacks_together(reports, config)
     for report in reports:
         print(report.as_text(), file=sys.stderr if report.error else sys.stdout)
-    if len(reports) > 1:
-        verdicts = [f'together not enough: {lack}' for lack in lacks]
-        print(*(verdicts or ['together: enough to train on']), sep='\n')
+    together = [f'together not enough: {lack}' for lack in lacks]
+    together = (together or ['together: enough to train on']) if len(reports) > 1 else []
+    print(*together, sep='\n', end='\n' if together else '')
     sys.stdout.flush()  # the findings, before an error in writing them
     if arguments.json:
-        together = {'enough_to_train_on': not lacks, 'lacks': lacks}
         bags = [report.as_dict() for report in reports]
-        write_json(arguments.json, {'bags': bags, 'together': together})
+        all_bags = {'enough_to_train_on': not lacks, 'lacks': lacks}
+        write_json(arguments.json, {'bags': bags, 'together': all_bags})
     if arguments.report:
-        _write_report(arguments.report, reports)
+        _write_report(arguments.report, reports, together)
     if any(report.error or any(topic.unreadable for topic in report.topics) for report in reports):
         return 1
     return NOT_ENOUGH if lacks else 0
 
 
-def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:
-    """Write figures of all bags, and the page that shows them."""
+def _write_report(folder: Path, reports: Sequence[BagReport], together: Sequence[str]) -> None:
+    """Write figures of all bags, and the page that shows them, with verdicts on all together."""
+    from sfa_localization.reports import page
     from sfa_localization.reports.bag import bag_sections, write_path
     from sfa_localization.reports.figures import write_contact_sheet
-    from sfa_localization.reports.page import PAGE, begin_page, write_page
 
-    begin_page(folder)
-    sections = []
+    page.begin_page(folder)
+    sections = [page.section('Are they enough together?', page.items(together))]
     for number, report in enumerate(reports):
         stem = Path(report.path).stem
         figures = dict[Path, str]()
@@ -100,5 +100,5 @@ def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:
             figures[target] = 'Images from all over the drive'
         facts = [': '.join(fact) for fact in report.facts.items()]
         sections += bag_sections(report.as_dict(), facts, figures)
-    write_page(folder, 'What is in the recording', *sections)
-    print(f'{folder / PAGE}: written')
+    page.write_page(folder, 'What is in the recording', *sections)
+    print(f'{folder / page.PAGE}: written')

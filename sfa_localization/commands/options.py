@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Iterable, Sequence
+import logging
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -32,6 +34,31 @@ TOPIC_OPTIONS = {
 }
 REPORT_FILES = ('.html', '.md', '.png')
 """Kinds of files in the folder of a report."""
+
+
+class _Noticed(logging.Handler):
+    """Keeps the texts of warnings; where nothing else does, it prints them as without it."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.texts.append(record.getMessage())
+        if not logging.getLogger().handlers and logging.lastResort is not None:
+            logging.lastResort.handle(record)
+
+
+@contextmanager
+def noticed() -> Iterator[list[str]]:
+    """The warnings of the package meanwhile, for the page: it says what the terminal has said."""
+    handler = _Noticed()
+    package = logging.getLogger('sfa_localization')
+    package.addHandler(handler)
+    try:
+        yield handler.texts
+    finally:
+        package.removeHandler(handler)
 
 
 def require_output(output: Path, inputs: Iterable[Path | None], *suffixes: str) -> None:

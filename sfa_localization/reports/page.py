@@ -17,6 +17,8 @@ from sfa_localization.reports.summary import WEAK as WEAK
 
 PAGE = 'index.html'
 MARK = '<meta name="generator" content="sfa_localization">'
+NOTICED = 'What was noticed?'
+"""The heading above the warnings that a command has printed."""
 _STYLE = """
 :root { color-scheme: light; }
 * { box-sizing: border-box; }

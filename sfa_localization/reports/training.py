@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from sfa_localization.reports import figures, page
 from sfa_localization.reports.bag import motion_section
 from sfa_localization.reports.evaluation import firing_maps_figure
 from sfa_localization.reports.figures import WorstImage
-from sfa_localization.reports.summary import judgment, summary
+from sfa_localization.reports.summary import has_forecast, judgment, summary
 from sfa_localization.training import Trained
 
 FEW_CROSSINGS = 5
@@ -55,9 +55,10 @@ def write_training_report(
     trained: Trained,
     samples: Mapping[WorstImage, Image] | None = None,
     lens: bytes = b'',
+    warnings: Sequence[str] = (),
 ) -> None:
     """Write figures of the training, with `samples` of the worst images and a picture (PNG) of the
-    lens, and index.html.
+    lens, and index.html, which repeats the warnings of the training.
 
     Raises LocalizationError if a file cannot be written.
     """
@@ -73,13 +74,17 @@ def write_training_report(
     drawn = {'lens': bool(lens), 'worst_images': bool(samples)}
     names = [name for name in _CAPTIONS if drawn.get(name, True)]
     parts = {name: page.figure(folder / f'{name}.png', _CAPTIONS[name]) for name in names}
+    grade, sentence = judgment(trained)
+    told = summary(trained).splitlines()
     page.write_page(
         folder,
         f'Training on {", ".join(run.name for run in trained.runs)}',
-        page.verdict(*judgment(trained)),
-        page.section('Is my map good?', page.items(summary(trained).splitlines()),
+        page.verdict(grade, sentence),
+        page.section('Is my map good?', page.items([line for line in told if line != sentence]),
                      parts['line_fits']),
-        page.section('Where is it weak?', page.items(weak_lines(trained)), parts['coverage']),
+        page.section(page.NOTICED, page.items([text for text in warnings if text not in told])),
+        page.section('Where is it weak?', page.items(weak_lines(trained)), parts['coverage'])
+        if has_forecast(grade, trained.model.quality) else '',
         page.section('May I trust it?', page.items(trust_lines(trained))),
         page.section('What do I drive next?', page.items(advice(trained, places))),
         *(motion_section(check.as_dict()) for check in trained.checks),

@@ -15,10 +15,16 @@ from sfa_localization.reports.figures import as_title, in_meters, save
 
 
 def write_update_report(
-    folder: Path, title: str, sentence: str, keyframes: Sequence[tuple[str, Array]]
+    folder: Path,
+    title: str,
+    sentence: str,
+    keyframes: Sequence[tuple[str, Array]],
+    warnings: Sequence[str] = (),
 ) -> None:
     """Write `folder`/index.html with a map of the keyframes, poses (K, 3) by the name of their
-    drives, of which the first are those of the training. Raises LocalizationError.
+    drives, of which the first are those of the training, and the warnings of the update.
+
+    Raises LocalizationError.
     """
     keyframes_figure(folder / 'keyframes.png', keyframes)
     lines = [f'{name}: {len(poses)} keyframes' for name, poses in keyframes]
@@ -29,6 +35,7 @@ def write_update_report(
         page.section('What is in the model?', page.items(lines),
                      page.figure(folder / 'keyframes.png', 'Where keyframes were taken: those of '
                                  'the training (gray), and of each later drive')),
+        page.section(page.NOTICED, page.items(warnings)),
         page.section('May I trust it?', page.items([
             'Evaluate both models on another drive in the new light: evaluate MODEL BAG --report.',
         ])),
