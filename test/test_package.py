@@ -59,7 +59,10 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'updating': (CORE - METHOD | {'place_model', 'observer', 'localizer'}, NUMERIC),
     'inspection': (CORE - {'sfa'}, NUMERIC | {'cv2'}),
     'filtering': ({'data', 'fusion'}, {'numpy'}),
-    'reports': ({'data', 'camera', 'training', 'inspection'} | METHOD, {'numpy', 'matplotlib'}),
+    'reports': (
+        {'data', 'camera', 'training', 'inspection'} | METHOD,
+        {'numpy', 'matplotlib', 'PIL'},  # PIL comes with matplotlib
+    ),
     'nodes': (
         {'data', 'camera', 'fusion', 'mapping', 'place_model', 'observer', 'config'},
         {'numpy', 'yaml', 'nav2_msgs'} | ROS,  # nav2_msgs where it is installed

@@ -25,14 +25,17 @@ from sfa_localization.data.run import Trajectory
 from sfa_localization.reports import evaluation, page, training
 
 FOREIGN = re.compile(r'<(script|link|iframe)|href=|srcset=|onload=|onclick=|url\(|@import')
+LARGEST = 1_500_000
+"""Bytes of a page."""
 PREFIX = re.compile('^(note|problem|corrected|not enough to train on|error|together not enough): ')
-IMAGE = re.compile(r'<img[^>]* src="data:image/png;base64,([^"]+)"[^>]*>')
+IMAGE = re.compile(r'<img[^>]* src="data:image/webp;base64,([^"]+)"[^>]*>')
 
 
 def read(folder):
     """Headings, images and text of a page, which needs no other file, and is legible on a phone."""
     text = (folder / page.PAGE).read_text('utf-8')
-    assert 'viewport' in text and not FOREIGN.search(text)
+    assert 'viewport' in text and 'prefers-color-scheme: dark' in text and not FOREIGN.search(text)
+    assert len(text) < LARGEST and text.count('<table') == text.count('<div class="wide"><table')
     for tag in ('h2', 'p', 'table', 'tr', 'td', 'figure', 'div'):
         assert len(re.findall(f'<{tag}[ >]', text)) == text.count(f'</{tag}>'), tag
     raw = [np.frombuffer(base64.b64decode(data), np.uint8) for data in IMAGE.findall(text)]
@@ -156,6 +159,8 @@ def test_the_page_of_an_evaluation(judged, tmp_path):
         '2 times measurement: outside the gate', 'aligned on a drive',
     ):  # fmt: skip
         assert words in content.text, 'escaped, and read back'
+    text = (tmp_path / page.PAGE).read_text('utf-8')
+    assert text.count('class="wide broad"') == 2, 'overview and errors'
 
 
 def test_the_answer_about_a_drive_follows_its_figures(judged):

@@ -82,7 +82,7 @@ def test_the_page_of_an_update_shows_what_each_drive_added(tmp_path):
     first = int(again.keyframes.first.sum())
     for line in (f'training: {first}', f'later: {len(new)}', 'a &lt;later&gt; $one: 5'):
         assert f'<li>{line} keyframes</li>' in text
-    assert 'added as keyframes' in text and text.count('<img src="data:image') == 1
+    assert 'added as keyframes' in text and text.count('<img ') == 1
     assert_allclose(keyframes[2][1], new.poses[:5])
 
 
