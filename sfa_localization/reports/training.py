@@ -27,6 +27,8 @@ FEW_CROSSINGS = 5
 PARALLEL = 0.3
 """Spread of driving directions (0 parallel, 1 even) below which the drive was one-sided."""
 _WEAK = 1.5  # times the expected error, from which a place counts as weak
+SHOWN = 95
+"""Percentile of the expected errors up to which colors differ: a few corners would use up all."""
 _CAPTIONS = {
     'coverage': 'Where images were taken (black), on the expected error of one image',
     'line_fits': 'Each segment by odometry (wide) and by slow features (thin)',
@@ -154,10 +156,12 @@ def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
     figure = Figure(figsize=(7.0, 6.0), layout='constrained')
     axes = figure.subplots()
     expected = trained.metric.forecast
-    dots = axes.scatter(
-        expected.places[:, 0], expected.places[:, 1], c=expected.local, s=30, cmap='viridis'
-    )
-    figure.colorbar(dots, ax=axes, label='expected position error of one image (m)')
+    local = expected.local
+    x, y = expected.places.T
+    top = float(np.percentile(local, SHOWN))
+    dots = axes.scatter(x, y, c=local, s=30, cmap='viridis', vmin=0.0, vmax=top)
+    label = 'expected position error of one image (m)'
+    figure.colorbar(dots, ax=axes, label=label, extend='max')
     axes.scatter(places[:, 0], places[:, 1], s=2, color='black')
     x, y, error = expected.worst
     axes.plot(x, y, 'x', color='red', markersize=10, label=f'worst: {error:.2f} m')
