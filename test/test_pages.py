@@ -5,6 +5,7 @@
 import base64
 import html
 import itertools
+import json
 import logging
 import re
 from dataclasses import replace
@@ -202,6 +203,29 @@ def test_the_page_of_an_inspection(tmp_path, capsys):
         'Are they enough together?', 'What do I drive or change next?', 'What is in it?'
     ]  # fmt: skip
     assert len(content.images) == 2
+
+
+def results(mean, grade='good'):
+    row = {'mean': mean, 'p95': 2 * mean, 'max': 0.5}
+    return {'odometry': row, 'ekf': {**row, 'max': None}, 'grade': grade, 'sentence': f'{mean} <m>'}
+
+
+def test_two_evaluations_are_shown_side_by_side(tmp_path, capsys):
+    files = [tmp_path / 'before.json', tmp_path / 'after.json']
+    for file, result in zip(files, (results(0.1), results(0.04, 'weak')), strict=True):
+        file.write_text(json.dumps(result))
+    words = ['evaluate', *map(str, files)]
+    assert main([*words, '--report', str(tmp_path / 'report')]) == 0
+    told, content = capsys.readouterr().out, read(tmp_path / 'report')
+    cells = ['0.100', '0.040', '0.200', '0.080', '-', '-']
+    (row,) = (line for line in told.splitlines() if line.startswith('| EKF'))
+    assert [cell.strip() for cell in row.split('|')[2:-1]] == cells
+    assert 'second: 0.04 <m>' in told and 'after.json: 0.04 <m>' in content.text
+    assert all(cell in content.text for cell in cells)
+    files[1].write_text('{"ekf": {"mean": 1}}')
+    assert main(words) == 1
+    error = capsys.readouterr().err
+    assert error == f'error: {files[1]}: holds no results: write them by evaluate --json\n'
 
 
 def path(seconds, poses):
