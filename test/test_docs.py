@@ -394,6 +394,10 @@ def test_a_launch_ends_with_what_cannot_start_and_starts_again_what_dies(launch,
     assert exited(CANNOT_START, ending) is None
 
 
+def test_the_reference_for_python_is_that_of_the_docstrings():
+    assert PAGES['config/python.md'] == runpy.run_path(str(ROOT / '.ci/reference'))['page']()
+
+
 def test_pages_name_tests_that_exist():
     """And test/README.md shows the faults of promises.py."""
     problems, faults = PAGES['config/problems.md'], PAGES['test/README.md']

@@ -49,6 +49,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'metric': ({'data', 'keyframes', 'motion'}, NUMERIC),
     'mapping': ({'data', 'sfa', 'keyframes', 'motion', 'metric'}, NUMERIC),
     'place_model': ({'data', 'camera', 'sfa', 'keyframes', 'mapping'}, {'numpy'}),
+    'library': ({'data', 'camera', 'bags', 'place_model'}, set()),
     'observer': ({'data', 'camera', 'keyframes', 'place_model'}, {'numpy'}),
     'localizer': ({'data', 'camera', 'fusion', 'place_model', 'observer'}, set()),
     'simulation': ({'data', 'camera', 'bags'}, NUMERIC | {'cv2', 'trimesh', 'embreex'}),
@@ -236,6 +237,8 @@ MAIN = 'from sfa_localization import cli\ntry: cli.main({})\nexcept SystemExit: 
 
 
 @pytest.mark.parametrize(('code', 'unwanted'), [
+    ('import sfa_localization', {'numpy', f'{NAME}.library', f'{NAME}.place_model'}),
+    ('from sfa_localization import PlaceModel', {'mdp', 'rosbags', 'filterpy', 'matplotlib'}),
     ('import sfa_localization.fusion.pose_filter', {'cv2', 'mdp', 'rosbags'}),
     ('import sfa_localization.camera.panorama', {'scipy', 'filterpy', 'mdp', 'matplotlib'}),
     ('import sfa_localization.observer', {'filterpy', 'mdp', 'trimesh', 'rosbags'}),
