@@ -75,7 +75,8 @@ _AHEAD_S = 0.3  # of the path: odometry may be a little behind
 class Health(NamedTuple):
     """The probability that all is `well`, and the likeliest fault with its size.
 
-    `confirmed_m` of `needed_m` were driven since the estimate was placed.
+    `confirmed_m` of `needed_m` were driven since the estimate was placed. Where messages have
+    `waited_s` for this program, they seem late, and no clock is to blame.
     """
 
     well: float
@@ -83,15 +84,28 @@ class Health(NamedTuple):
     size: complex
     confirmed_m: float
     needed_m: float
+    waited_s: float = 0.0
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether images seem late, and messages had to wait."""
+        return self.well < LIKELY and self.fault == 'late' and self.waited_s > 0
 
     @property
     def problems(self) -> list[str]:
         """Why the estimate is not trusted, in words."""
         problems = [] if self.well >= LIKELY else [_sentence(self.fault, self.size)]
+        if self.is_busy:
+            problems = [busy(self.waited_s)]
         if self.confirmed_m < self.needed_m:
             so_far = f'{self.confirmed_m:.1f} of {self.needed_m:.0f} m'
             problems.append(f'placed, confirmed over {so_far}: driving on confirms it')
         return problems
+
+
+def busy(waited_s: float) -> str:
+    """That messages had to wait for this program, in words."""
+    return f'messages have waited {waited_s:.1f} s: this computer is too busy'
 
 
 def _sentence(fault: str, size: complex) -> str:
