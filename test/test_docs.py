@@ -43,7 +43,9 @@ INLINE = re.compile(r'`((?:sfa_localization|make) [^`]+)`')
 LINK = re.compile(r'\]\(([^)#\s]+)\)')
 TOPIC = re.compile(r'\b((?:sfa|ekf)/[a-z_]+)\b')
 TOPIC_ROW = re.compile(r'^\| `/?([\w/]+)` \| (\w+) \|([^|]+)\|([^|]+)\|', re.MULTILINE)
-OTHER_TOPICS = re.compile(r'/(rosout|parameter_events|diagnostics|tf|\w+/transition_event)')
+OTHER_TOPICS = re.compile(
+    r'/(rosout|parameter_events|diagnostics|tf(_static)?|\w+/transition_event)'
+)
 TEST_NAME = re.compile(r'`(test_\w+\.py)::(\w+)`')
 # Programs of other packages, whose arguments are not checked.
 FOREIGN = {
@@ -348,8 +350,9 @@ def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
         assert set(node['parameters'][1]) <= parameters()
         assert 'autostart' not in node['parameters'][1]
         sources = {source for source, _ in node['remappings']}
-        assert sources <= topics() | {'image_raw', 'odom', '/tf'}
+        assert sources <= topics() | {'image_raw', 'odom', '/tf', '/tf_static'}
     assert ('/tf', 'tf') in launched['ekf_node']['remappings']
+    assert ('/tf_static', 'tf_static') in launched['sfa_node']['remappings']
     assert ('/tf', '/tf') in launch(tf='/tf')['ekf_node']['remappings']
     assert [*launch(ekf='false')] == ['omnicam_node', 'sfa_node']
     assert [*launch(rviz='true')] == [*NODES, 'rviz2']
@@ -369,7 +372,9 @@ def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
         launch(config='/nowhere.yaml')  # launch_ros itself only warns, and starts with defaults
     (composed,) = launch(composed='true', odom='wheels', autostart='false').values()
     assert composed['executable'] == 'localization' and 'name' not in composed
-    assert {'image_raw', 'odom', '/tf', 'imu/data'} <= {name for name, _ in composed['remappings']}
+    assert {'image_raw', 'odom', '/tf', '/tf_static', 'imu/data'} <= {
+        name for name, _ in composed['remappings']
+    }
     with pytest.raises(ValueError, match='leave panorama:= and ekf:= out'):
         launch(composed='true', ekf='false')
     with pytest.raises(FileNotFoundError, match=r'params_file:=/nowhere\.yaml'):
