@@ -65,9 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate; print the errors, and counts of used and rejected inputs."""
     from sfa_localization import evaluation
-    from sfa_localization.filtering import write_trajectory
     from sfa_localization.place_model import PlaceModel
-    from sfa_localization.reports.evaluation import count_lines, judgment, tables, trust_lines
+    from sfa_localization.reports.evaluation import count_lines, tables, trust_lines
 
     if arguments.model.suffix == arguments.bag.suffix == '.json':
         return _compare(arguments)
@@ -103,6 +102,17 @@ def run(arguments: argparse.Namespace) -> int:
     print(tables(result.scores), *trust_lines(result.scores), sep='\n')
     print(*count_lines(result.counts), sep='\n')
     print(f'aligned on {result.aligned_on}', *result.corrections, sep='\n')
+    _write_files(arguments, result, warnings)
+    return 0
+
+
+def _write_files(
+    arguments: argparse.Namespace, result: Evaluation, warnings: Sequence[str]
+) -> None:
+    """Write what was asked for, the report last."""
+    from sfa_localization.filtering import write_trajectory
+    from sfa_localization.reports.evaluation import judgment
+
     if arguments.json:
         grade, sentence = judgment(result.scores, result.counts)
         write_json(arguments.json, {**result.as_dict(), 'grade': grade, 'sentence': sentence})
@@ -110,7 +120,6 @@ def run(arguments: argparse.Namespace) -> int:
         write_trajectory(path, arguments.tum / f'{name}.tum')
     if arguments.report:
         _write_report(arguments, result, warnings)
-    return 0
 
 
 def _compare(arguments: argparse.Namespace) -> int:

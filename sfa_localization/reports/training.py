@@ -64,18 +64,8 @@ def write_training_report(
 
     Raises LocalizationError if a file cannot be written.
     """
-    images = trained.metric.images
     places = trained.metric.poses[:, :2]
-    coverage_figure(folder / 'coverage.png', trained, places)
-    line_fits_figure(folder / 'line_fits.png', trained, places)
-    firing_maps_figure(folder / 'firing_maps.png', places, trained.features[images])
-    if samples:
-        figures.write_worst_images(folder / 'worst_images.png', samples)
-    if lens:
-        write_bytes(folder / 'lens.png', lens)
-    drawn = {'lens': bool(lens), 'worst_images': bool(samples)}
-    names = [name for name in _CAPTIONS if drawn.get(name, True)]
-    parts = {name: page.figure(folder / f'{name}.png', _CAPTIONS[name]) for name in names}
+    parts = _figures(folder, trained, samples, lens)
     grade, sentence = judgment(trained)
     told = summary(trained).splitlines()
     page.write_page(
@@ -94,6 +84,24 @@ def write_training_report(
         page.section('Slow features', parts['firing_maps']),
         page.section('Worst images', parts.get('worst_images', '')),
     )  # fmt: skip
+
+
+def _figures(
+    folder: Path, trained: Trained, samples: Mapping[WorstImage, Image] | None, lens: bytes
+) -> dict[str, str]:
+    """Write the figures; parts of the page by their names in _CAPTIONS."""
+    images = trained.metric.images
+    places = trained.metric.poses[:, :2]
+    coverage_figure(folder / 'coverage.png', trained, places)
+    line_fits_figure(folder / 'line_fits.png', trained, places)
+    firing_maps_figure(folder / 'firing_maps.png', places, trained.features[images])
+    if samples:
+        figures.write_worst_images(folder / 'worst_images.png', samples)
+    if lens:
+        write_bytes(folder / 'lens.png', lens)
+    drawn = {'lens': bool(lens), 'worst_images': bool(samples)}
+    names = [name for name in _CAPTIONS if drawn.get(name, True)]
+    return {name: page.figure(folder / f'{name}.png', _CAPTIONS[name]) for name in names}
 
 
 def weak_places(forecast: Forecast) -> list[WorstImage]:
