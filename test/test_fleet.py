@@ -137,6 +137,7 @@ def test_a_garden_is_trained_as_by_train_then_updated_and_never_loses_its_model(
     garden.work(place)
     later = place.result()
     assert 'later: ' in later['sentences'][1] and place.is_up_to_date()
+    assert (place.output / 'update_later/index.html').is_file()
     assert later['sentences'][0] == first['sentences'][1]
     assert later['trained_s'] == first['trained_s'] != 0 and later['change_m'] == 0
 

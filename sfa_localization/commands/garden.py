@@ -149,8 +149,12 @@ def _learn(garden: Garden, before: Mapping[str, Any], inputs: Mapping[str, Any])
     if not useful or changed - {TESTS, *(drive.name for drive in added)}:
         return [_train(garden, config)]
     words = *config, '--update', garden.model, '--output', garden.model
-    updates = [_attempt(train, garden.output / 'update.json', drive, *words) for drive in added]
-    return [_read_json(garden.output / TRAINING), *updates]
+    judgments: list[Judgment] = [_read_json(garden.output / TRAINING)]
+    for drive in added:
+        page = garden.output / f'update_{drive.name}'
+        report = *words, '--report', page
+        judgments.append(_attempt(train, garden.output / 'update.json', drive, *report))
+    return judgments
 
 
 def _train(garden: Garden, config: Sequence[Path | str]) -> Judgment:
