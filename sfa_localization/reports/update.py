@@ -43,7 +43,7 @@ def write_update_report(
 
 
 def keyframes_figure(path: Path, keyframes: Sequence[tuple[str, Array]]) -> None:
-    """Draw where the keyframes of each drive were taken."""
+    """Draw where the keyframes of each drive were taken, poses (K, 3) by its name."""
     figure = Figure(figsize=(7.0, 6.0), layout='constrained')
     axes = figure.subplots()
     for number, (name, poses) in enumerate(keyframes):
