@@ -18,6 +18,7 @@ from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import integrate
 from sfa_localization.fusion.ekf import Ekf, replaced
+from sfa_localization.fusion.health import MISSING
 from sfa_localization.fusion.motion import DELAY, LOSS, SCALE, SIZE, Pace, Twist
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
@@ -210,6 +211,18 @@ def test_turns_show_by_how_much_images_are_stamped_late(late_s):
         assert 'this computer is too busy' in ' '.join(fused.status.reasons)
     else:
         assert np.mean(errors[-500:]) < 0.15 and fused.status.level is Level.LOCALISED
+
+
+def test_where_odometry_is_lost_no_other_fault_is_named():
+    """As on a computer that is too busy, whose queues overflow: half of each five seconds."""
+    drive, fused, said = FilterDrive(seconds=45, rate_hz=25, every=4, **NOISY), started(), set()
+    for stamp_ns, kind, index in drive.events():
+        if kind or (stamp_ns - drive.stamps_ns[0]) % (5 * SECOND) > 2.4 * SECOND:
+            drive.give(fused, (stamp_ns, kind, index), True)
+            said.update(fused.status.reasons)
+    assert MISSING in said
+    named = 'stamped', 'the camera', 'skid', 'times as far', 'different motions'
+    assert [text for text in said if any(word in text for word in named)] == []
 
 
 def test_messages_that_waited_show_no_clock():
