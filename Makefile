@@ -12,7 +12,7 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo reproduce study test robustness troubles animation map fuzz soak bench lint format colcon matrix clean
+.PHONY: help env demo reproduce study test robustness troubles animation map fuzz soak bench reference lint format colcon matrix clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -57,6 +57,9 @@ soak: $(READY)  ## run the three nodes for an hour at 20x; nothing may grow (ARG
 
 bench: $(READY)  ## speeds beside the last release, on an idle machine; writes the table of test/README.md (ARGS=--quick)
 	$(PY) test/benchmarks/bench_all.py $(ARGS)
+
+reference: $(READY)  ## write config/python.md, the reference for programs in Python, from docstrings
+	$(PY) .ci/reference
 
 lint: $(READY)  ## ruff, ruff format, mypy, lines of each room beside its budget
 	$(VENV)/bin/ruff check .

@@ -90,15 +90,19 @@ def _nodes(context: LaunchContext) -> list:
     images.append(('imu/data', given['imu']))
     # As Nav2 does, so that robots with frames of the same names do not meet on /tf.
     odometry = [('odom', given['odom']), ('/tf', given['tf'])]
+    static = [('/tf_static', f'{given["tf"]}_static')]
     if _is_true(given, 'composed'):
         if panorama or given['ekf'] != 'true':
             raise ValueError('composed:=true runs all nodes: leave panorama:= and ekf:= out')
-        chain = node('localization', images + odometry, {**model, **transport})
+        chain = node('localization', images + odometry + static, {**model, **transport})
         return [PushROSNamespace(given['namespace']), chain, _rviz(given)]
     if panorama:
-        seeing = [node('sfa_node', [('panorama', panorama)], {**model, **transport})]
+        seeing = [node('sfa_node', [('panorama', panorama), *static], {**model, **transport})]
     else:
-        seeing = [node('omnicam_node', images, {**model, **transport}), node('sfa_node', [], model)]
+        seeing = [
+            node('omnicam_node', images, {**model, **transport}),
+            node('sfa_node', static, model),
+        ]
     ekf = node('ekf_node', odometry, {}, condition=IfCondition(given['ekf']))
     return [PushROSNamespace(given['namespace']), *seeing, ekf, _rviz(given)]
 

@@ -142,8 +142,8 @@ def guarded(run: Callable[[], int]) -> int:
         reason = ' '.join(str(error).split()) or 'not enough memory'
     except (KeyboardInterrupt, ImportError) as error:
         # KeyboardInterrupt is the cause if the import of a C++ library was interrupted.
-        if isinstance(error.__cause__ or error, KeyboardInterrupt):
-            print('interrupted', file=sys.stderr)
+        if isinstance(cause := error.__cause__ or error, KeyboardInterrupt):
+            print('interrupted', *cause.args, sep=': ', file=sys.stderr)
             return 130
         if 'failed to map segment' not in str(error):  # of a library, for lack of memory
             raise

@@ -21,7 +21,7 @@ from sfa_localization.data.files import atomic_write, read_text
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.progress import progress_over
 from sfa_localization.data.rejections import short_line
-from sfa_localization.data.run import Odometry, Stamps
+from sfa_localization.data.run import Odometry, Stamps, Trajectory
 from sfa_localization.fusion.inputs import POSITION_STD
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.replay import FilterTrack, replay
@@ -189,12 +189,23 @@ def write(filtered: Filtered, path: Path, beside: Path) -> None:
     with atomic_write(path, DataError) as poses, atomic_write(beside, DataError) as spreads:
         spreads.write(b'stamp_s,var_x,cov_xy,cov_xyaw,var_y,cov_yyaw,var_yaw\n')
         rows = zip(filtered.stamps_ns, filtered.poses, filtered.covariances, strict=True)
-        for stamp_ns, (x, y, yaw), matrix in rows:
-            stamp = _seconds(int(stamp_ns))
-            turn = f'{math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}'
+        for stamp_ns, pose, matrix in rows:
             cells = ','.join(f'{cell:.9g}' for cell in matrix[np.triu_indices(3)])
-            poses.write(f'{stamp} {x:.6f} {y:.6f} 0 0 0 {turn}\n'.encode())
-            spreads.write(f'{stamp},{cells}\n'.encode())
+            poses.write(_tum_line(stamp_ns, pose))
+            spreads.write(f'{_seconds(int(stamp_ns))},{cells}\n'.encode())
+
+
+def write_trajectory(trajectory: Trajectory, path: Path) -> None:
+    """Write lines of `stamp x y z qx qy qz qw`, 0 for an unknown heading. Raises DataError."""
+    with atomic_write(path, DataError) as file:
+        for stamp_ns, pose in zip(trajectory.stamps_ns, trajectory.poses, strict=True):
+            file.write(_tum_line(stamp_ns, np.nan_to_num(pose)))
+
+
+def _tum_line(stamp_ns: int, pose: Array) -> bytes:
+    x, y, yaw = pose.tolist()
+    turn = f'{math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}'
+    return f'{_seconds(int(stamp_ns))} {x:.6f} {y:.6f} 0 0 0 {turn}\n'.encode()
 
 
 def _seconds(stamp_ns: int) -> str:

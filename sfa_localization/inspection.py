@@ -19,16 +19,15 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from sfa_localization.bags import decoding
-from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S, ReadingRecipe
+from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S, ReadingRecipe, unwrapper_of
 from sfa_localization.bags.lens_drive import lens_of
 from sfa_localization.bags.motion_arrays import stamps_of, to_yaw_rate
 from sfa_localization.bags.reader import Bag
-from sfa_localization.bags.settings import TopicNames
 from sfa_localization.bags.topic_stream import Stream, by_one_clock
 from sfa_localization.camera import body, kinds, lens_report
 from sfa_localization.camera.leveling import leaning
 from sfa_localization.camera.panorama import looks_like_panorama
-from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import FrozenWatch, frozen
 from sfa_localization.data.errors import BagError, LocalizationError, MessageError
@@ -156,10 +155,11 @@ class BagReport:
     """All findings about a bag; `lacks` are the reasons why it is not enough to train on; for those
     `of_drive`, other drives may make up.
 
-    `error` says why it cannot be read at all. `samples` are images from all over the drive, and
-    `camera` the kind of camera that they show, `lens` a sentence about its lens. `drives` are the
-    poses (M, 3) of images with `odometry` in each unbroken part of it; `motion` compares odometry,
-    images and gyroscope; `tilt` is that of the ground.
+    `error` says why it cannot be read at all. `samples` are images from all over the drive,
+    `camera` the kind of camera that they show, `lens` a sentence about its lens, which the settings
+    describe or not (`is_described`). `drives` are the poses (M, 3) of images with `odometry` in
+    each unbroken part of it; `motion` compares odometry, images and gyroscope; `tilt` is that of
+    the ground.
     """
 
     path: str
@@ -171,6 +171,7 @@ class BagReport:
     of_drive: list[str] = field(default_factory=list)
     image_topic: str = ''
     camera: kinds.CameraKind | None = None
+    is_described: bool = False
     lens: str = ''
     lens_title: str = 'lens'
     samples: list[Image] = field(default_factory=list)
@@ -184,6 +185,11 @@ class BagReport:
     def places(self) -> Array:
         """Poses (M, 3) of all images with odometry."""
         return np.concatenate([np.zeros((0, 3)), *self.drives])
+
+    @property
+    def sees_a_part(self) -> bool:
+        """Whether the images do not seem to show all directions, and no lens is described."""
+        return bool(self.camera and self.camera.lack) and not self.is_described
 
     @property
     def facts(self) -> dict[str, str]:
@@ -246,27 +252,25 @@ class BagReport:
 def inspect(
     path: Path | str,
     *,
-    topics: TopicNames | None = None,
+    recipe: ReadingRecipe | None = None,
     config: InspectionConfig | None = None,
-    clockwise: bool = True,
     strict: bool = False,
-    camera: CameraConfig | None = None,
 ) -> BagReport:
-    """Read a bag and report on it. Columns of panoramas grow `clockwise` seen from above. Of other
-    images the lens is learned, and compared with that which the `camera` describes.
+    """Read a bag as training reads it by the `recipe`, and report on it. The lens of images that
+    are no panoramas is learned, and compared with that which the recipe's camera describes.
 
-    Raises BagError when nothing in it can be read.
+    Raises BagError when nothing in it can be read, and CameraError for a lens that cannot be used.
     """
-    topics = topics or TopicNames()
+    recipe = recipe or ReadingRecipe()
     config = config or InspectionConfig()
-    report = BagReport(str(path))
-    with Bag(path, strict=strict) as bag:
-        report.image_topic = _topic_of(bag, 'image', topics.image, report)
-        report.odometry_topic = _topic_of(bag, 'odometry', topics.odometry, report)
-        _Survey(bag, report, topics, clockwise).fill()
+    report = BagReport(str(path), is_described=recipe.camera.is_described)
+    with Bag(path, strict=strict, config=recipe.bag) as bag:
+        report.image_topic = _topic_of(bag, 'image', recipe.topics.image, report)
+        report.odometry_topic = _topic_of(bag, 'odometry', recipe.topics.odometry, report)
+        _Survey(bag, report, recipe).fill()
         report.problems = bag.problems
         report.notes += bag.recording.notes
-    _see_lens(report, ReadingRecipe(topics, camera=camera or CameraConfig()))
+    _see_lens(report, recipe)
     if path_length(report.places) >= MOVED_M:
         report.notes += [ROUTE] if is_route(report.places) else []
         report.notes += [] if headings_differ(report.places) else [NO_LEVER_ARM]
@@ -280,7 +284,7 @@ def inspect(
 
 def _see_lens(report: BagReport, recipe: ReadingRecipe) -> None:
     """Fill in the lens that the drive shows, or what is missing to see it."""
-    if report.camera is None or report.camera.lack or report.odometry is None:
+    if report.camera is None or report.sees_a_part or report.odometry is None:
         return
     try:
         lens = lens_of(Path(report.path), recipe)
@@ -321,9 +325,12 @@ class _View(NamedTuple):
 class _Survey:
     """One pass over all topics of a bag."""
 
-    def __init__(self, bag: Bag, report: BagReport, topics: TopicNames, clockwise: bool) -> None:
+    def __init__(self, bag: Bag, report: BagReport, recipe: ReadingRecipe) -> None:
+        topics = recipe.topics
+        clockwise = recipe.panorama.clockwise
         self._bag = bag
         self._report = report
+        self._unwrap = unwrapper_of(bag, report.image_topic, recipe)
         self._gyro = VisualGyro(clockwise)
         self._frozen = FrozenWatch()
         self._repeats = 0
@@ -381,12 +388,22 @@ class _Survey:
             scale = min(SAMPLE_SIDE / max(size), 1.0)
             small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
             samples.append(np.asarray(small, np.uint8))
-        yaw = self._gyro.add(kinds.unrolled(image))
         new = self._frozen.add(image)
         self._repeats += not new
-        chosen = number % self._tilt_every == 0 and looks_like_panorama(*size)
+        image = self._unrolled(image)
+        yaw = self._gyro.add(image)
+        chosen = number % self._tilt_every == 0 and looks_like_panorama(*image.shape[:2])
         contrast = quantized(texture(image)[None]) if chosen else None
         return _View(yaw, self._gyro.texture if new else None, contrast)
+
+    def _unrolled(self, image: Image) -> Image:
+        """The panorama of an image, as training makes it; without a description of the lens, an
+        image that turns shift.
+        """
+        mounted = any(self._unwrap.camera.mount_rpy)
+        if self._unwrap.model or (mounted and looks_like_panorama(*image.shape[:2])):
+            return self._unwrap(image)
+        return kinds.unrolled(image)
 
     def _yaw_rate(self, message: Any) -> tuple[float, float]:
         """Yaw rate and its variance from an Imu; roll and pitch are kept if it has them."""
@@ -437,12 +454,13 @@ class _Survey:
         text = frozen(self._repeats, len(stamps))
         self._report.lacks += [text] if text else []
         turns = None
-        if camera and camera.shows_turns and not text:
+        described = bool(self._unwrap.model)
+        if camera and (described or camera.shows_turns) and not text:
             turns = stamps, np.array([view.yaw for view in views])
         small = {row: view.texture for row, view in enumerate(views) if view.texture is not None}
         textures = (stamps[[*small]], np.stack([*small.values()])) if small else None
         gyro = to_yaw_rate(self._used['imu'].values) if 'imu' in self._used else None
-        is_panorama = camera is not None and camera.is_panorama
+        is_panorama = described or (camera is not None and camera.is_panorama)
         commands = OpenLoop.of(odometry.twists).repeats
         return check_motion(odometry, turns, gyro, is_panorama, textures, commands)
 
@@ -575,7 +593,7 @@ def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
             f'{recorded - used} of {recorded} images have no odometry nearby: '
             'record both all the time, stamped by one clock'
         )
-    if report.camera.lack:
+    if report.sees_a_part:
         yield report.camera.lack
     if float(np.mean([sample.mean() for sample in report.samples])) < DARK:
         yield 'the images are dark: open the lens or wait for daylight'

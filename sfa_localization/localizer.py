@@ -13,8 +13,9 @@ from collections.abc import Sequence
 
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.run import Image
+from sfa_localization.data.run import Image, Run
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
+from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
@@ -76,6 +77,16 @@ class Localizer:
         stamp_ns = observation.stamp_ns
         self.filter.add_turned(stamp_ns, observation.turned)
         return self.filter.add_measurement(stamp_ns, observation.pose, observation.covariance)
+
+    def replay(self, drive: Run) -> FilterTrack:
+        """Feed a recorded drive in the order of its stamps, as the nodes would receive it: the
+        estimates at the stamps of its odometry, `poses` (stamps and poses (N, 3)) and `covariances`
+        (N, 3, 3) of [x m, y m, yaw rad] in the map.
+        """
+        images = self.observer.observe_run(drive)
+        fed = replay(self.filter, drive.odometry, drive.panoramas.stamps_ns, images)
+        states = (self.filter.at(stamp_ns) for stamp_ns, image, _ in fed if image is None)
+        return FilterTrack.of([state for state in states if state])
 
     @property
     def state(self) -> State | None:

@@ -80,6 +80,16 @@ class Updated:
     model: PlaceModel
     added: tuple[tuple[str, int], ...]
 
+    @property
+    def keyframes(self) -> list[tuple[str, Array]]:
+        """The poses (K, 3) of the keyframes of the training, and of each update, by its bag."""
+        keyframes = self.model.keyframes
+        named = [('training', keyframes.poses[keyframes.first])]
+        for number, update in enumerate(self.model.quality.get('updates', ())):
+            added = keyframes.lights == keyframes.trained + number
+            named.append((update['bag'], keyframes.poses[added]))
+        return named
+
     def sentence(self) -> str:
         """The number of added keyframes, in a sentence."""
         if not any(count for _, count in self.added):

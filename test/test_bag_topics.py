@@ -19,6 +19,7 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.satellite_fixes import east_north
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.writer import BagWriter, blank
+from sfa_localization.cli import main
 from sfa_localization.data.errors import BagError
 from sfa_localization.inspection import inspect
 
@@ -267,6 +268,17 @@ def test_stamps_that_cannot_be(tmp_path):
         bag.trajectory()
     with Bag(path, config=BagConfig(stamp_source='receive')) as bag:
         assert_allclose(bag.trajectory().poses, EXPECTED, atol=1e-12)
+
+
+def test_inspect_reads_stamps_as_the_parameter_file_says(tmp_path, capsys):
+    made = ('/camera', lambda: picture(0)), ('/odom', lambda: odometry(0, 0, 0, 0))
+    entries = [(topic, stamp(k), message()) for k in range(4) for topic, message in made]
+    words = ['inspect', str(record(tmp_path / 'bag', entries))]
+    (tmp_path / 'a.yaml').write_text('training: {ros__parameters: {stamp_source: receive}}')
+    main(words)
+    assert '/odom (Odometry): 0 messages' in capsys.readouterr().out
+    main([*words, '--config', str(tmp_path / 'a.yaml')])
+    assert '/odom (Odometry): 4 messages' in capsys.readouterr().out
 
 
 def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(tmp_path, caplog):

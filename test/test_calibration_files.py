@@ -205,3 +205,12 @@ def test_a_camera_info_of_a_part_of_the_image_is_that_of_the_part():
     lens = calibration_of_info(SimpleNamespace(distortion_model='plumb_bob', **fields))
     assert (lens.camera_model, lens.xi, lens.axis) == ('mirror', 0.0, 'forward'), 'a pinhole'
     assert (lens.cx, lens.cy, lens.image_width, lens.image_height) == (324.0, 360.0, 640, 640)
+
+
+def test_coefficients_with_powers_of_ten_are_numbers_as_programs_write_them(tmp_path):
+    """YAML 1.1 reads 4e-09 as a text."""
+    path = tmp_path / 'camera.yaml'
+    text = info('equidistant', coefficients=[0.0, 4e-9, 0.0, 0.0])
+    path.write_text(text.replace('4.0e-09', '4e-09'))
+    assert '4e-09' in path.read_text()
+    assert read_calibration(path).distortion == (0.0, 4e-9, 0.0, 0.0)

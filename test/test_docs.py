@@ -43,7 +43,9 @@ INLINE = re.compile(r'`((?:sfa_localization|make) [^`]+)`')
 LINK = re.compile(r'\]\(([^)#\s]+)\)')
 TOPIC = re.compile(r'\b((?:sfa|ekf)/[a-z_]+)\b')
 TOPIC_ROW = re.compile(r'^\| `/?([\w/]+)` \| (\w+) \|([^|]+)\|([^|]+)\|', re.MULTILINE)
-OTHER_TOPICS = re.compile(r'/(rosout|parameter_events|diagnostics|tf|\w+/transition_event)')
+OTHER_TOPICS = re.compile(
+    r'/(rosout|parameter_events|diagnostics|tf(_static)?|\w+/transition_event)'
+)
 TEST_NAME = re.compile(r'`(test_\w+\.py)::(\w+)`')
 # Programs of other packages, whose arguments are not checked.
 FOREIGN = {
@@ -143,6 +145,16 @@ def test_pages_are_of_the_version_and_date_of_the_recorded_results():
     for name, table in results_page.tables(record['results']).items():
         text = table or results_page.UNMEASURED
         assert f'<!-- {name} -->\n{text}<!-- end -->' in evaluation, name
+
+
+def test_the_page_names_the_speeds_above_what_is_allowed():
+    """And none that are not."""
+    block = PAGES['test/README.md'].split('<!-- bench -->')[1].split('<!-- end -->')[0]
+    rows = [[cell.strip() for cell in line.split('|')[1:-1]] for line in block.splitlines()[3:]]
+    rows = [row for row in rows if row and row[1] and row[3]]
+    above = [what for what, now, _, allowed in rows if float(now) > float(allowed)]
+    assert len(rows) > 5
+    assert f'\nMore than allowed: {"; ".join(above) or "nothing"}.\n' in block
 
 
 def test_the_evaluation_is_short():
@@ -339,8 +351,9 @@ def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
         assert set(node['parameters'][1]) <= parameters()
         assert 'autostart' not in node['parameters'][1]
         sources = {source for source, _ in node['remappings']}
-        assert sources <= topics() | {'image_raw', 'odom', '/tf'}
+        assert sources <= topics() | {'image_raw', 'odom', '/tf', '/tf_static'}
     assert ('/tf', 'tf') in launched['ekf_node']['remappings']
+    assert ('/tf_static', 'tf_static') in launched['sfa_node']['remappings']
     assert ('/tf', '/tf') in launch(tf='/tf')['ekf_node']['remappings']
     assert [*launch(ekf='false')] == ['omnicam_node', 'sfa_node']
     assert [*launch(rviz='true')] == [*NODES, 'rviz2']
@@ -360,7 +373,9 @@ def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
         launch(config='/nowhere.yaml')  # launch_ros itself only warns, and starts with defaults
     (composed,) = launch(composed='true', odom='wheels', autostart='false').values()
     assert composed['executable'] == 'localization' and 'name' not in composed
-    assert {'image_raw', 'odom', '/tf', 'imu/data'} <= {name for name, _ in composed['remappings']}
+    assert {'image_raw', 'odom', '/tf', '/tf_static', 'imu/data'} <= {
+        name for name, _ in composed['remappings']
+    }
     with pytest.raises(ValueError, match='leave panorama:= and ekf:= out'):
         launch(composed='true', ekf='false')
     with pytest.raises(FileNotFoundError, match=r'params_file:=/nowhere\.yaml'):
@@ -383,6 +398,10 @@ def test_a_launch_ends_with_what_cannot_start_and_starts_again_what_dies(launch,
     for code in (0, DIED, -9, -11):
         assert exited(code, running) is None
     assert exited(CANNOT_START, ending) is None
+
+
+def test_the_reference_for_python_is_that_of_the_docstrings():
+    assert PAGES['config/python.md'] == runpy.run_path(str(ROOT / '.ci/reference'))['page']()
 
 
 def test_pages_name_tests_that_exist():

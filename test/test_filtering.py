@@ -12,7 +12,15 @@ from places import distances
 
 from sfa_localization.cli import main
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.filtering import ODOMETRY, POSITIONS, Table, read_table, run_filter
+from sfa_localization.data.run import Trajectory
+from sfa_localization.filtering import (
+    ODOMETRY,
+    POSITIONS,
+    Table,
+    read_table,
+    run_filter,
+    write_trajectory,
+)
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 
@@ -176,3 +184,14 @@ def test_nothing_that_is_read_is_replaced(tmp_path, capsys, name):
     assert main(['filter', *map(str, logs), '--output', str(tmp_path / name)]) == 1
     assert 'would be replaced' in capsys.readouterr().err
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_trajectory_is_written_for_evo(tmp_path):
+    """A heading that is unknown is 0."""
+    stamps = np.array([1_700_000_000_123_456_789, 1_700_000_001_000_000_000])
+    poses = np.array([[1.5, -2.0, np.pi / 3], [0.0, 1.0, np.nan]])
+    write_trajectory(Trajectory(stamps, poses), tmp_path / 'new' / 'truth.tum')
+    assert (tmp_path / 'new' / 'truth.tum').read_text().splitlines() == [
+        '1700000000.123456789 1.500000 -2.000000 0 0 0 0.500000000 0.866025404',
+        '1700000001.000000000 0.000000 1.000000 0 0 0 0.000000000 1.000000000',
+    ]

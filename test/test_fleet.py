@@ -83,6 +83,13 @@ def test_a_cluster_works_by_the_same_rules(gardens):
     assert [len(gardens.tries(name)) for name in 'ab'] == [1, 2]
 
 
+def test_a_long_work_says_that_it_goes_on(gardens, monkeypatch, capsys):
+    """Also before the first garden is done."""
+    monkeypatch.setattr(fleet, 'LOG_PERIOD_S', 0.05)
+    gardens('--workers', '1', a='good')
+    assert 'running 1, refused 0: 0% of 1 gardens' in capsys.readouterr().err
+
+
 def test_ctrl_c_ends_the_processes_and_leaves_a_page(gardens, monkeypatch):
     monkeypatch.setattr(fleet, 'wait', mock.Mock(side_effect=KeyboardInterrupt))
     code, results = gardens('--workers', '1', a='good', b='good')
@@ -130,6 +137,7 @@ def test_a_garden_is_trained_as_by_train_then_updated_and_never_loses_its_model(
     garden.work(place)
     later = place.result()
     assert 'later: ' in later['sentences'][1] and place.is_up_to_date()
+    assert (place.output / 'update_later/index.html').is_file()
     assert later['sentences'][0] == first['sentences'][1]
     assert later['trained_s'] == first['trained_s'] != 0 and later['change_m'] == 0
 
@@ -143,6 +151,14 @@ def test_a_garden_is_trained_as_by_train_then_updated_and_never_loses_its_model(
     assert garden.work(place) == 'refused' and place.model.read_bytes() == data
     assert place.is_up_to_date()
     assert place.result()['expected_error_m'] == later['expected_error_m']
+
+
+def test_the_worst_tested_error_of_a_garden_is_among_its_results():
+    tests = [{'grade': 'good', 'ekf': {'mean': mean, 'p95': 2 * mean, 'max': 3 * mean, 'n': 5}}
+             for mean in (0.1, 0.25)]  # fmt: skip
+    tests += [{'grade': 'weak', 'sentence': 'not used'}, {'ekf': {'mean': None}}]
+    assert garden._tested(tests) == {'mean_m': 0.25, 'p95_m': 0.5, 'max_m': 0.75}
+    assert garden._tested(tests[2:]) == {}
 
 
 def test_a_drive_that_an_update_cannot_use_is_named_and_the_model_stays(place, monkeypatch):
@@ -189,18 +205,23 @@ def test_the_page_is_in_order_escaped_and_needs_no_other_file(tmp_path):
     (tmp_path / 'a<b & c' / 'inspection' / 'index.html').touch()
     good = {'garden': 'good', 'grade': 'good', 'state': 'good', 'sentences': ['The map is good']}
     weak = {**good, 'garden': 'weak', 'grade': 'weak', 'state': 'weak', 'expected_error_m': 0.8}
+    tested = {'mean_m': 0.05, 'p95_m': 0.125, 'max_m': 0.3}
     rows = [
         {**good, 'expected_error_m': 0.1, 'change_m': -0.2, 'area_m2': 50.4, 'trained_s': 8.64e4},
         {'garden': 'a<b & c', 'grade': 'bad', 'state': 'refused', 'sentences': ['no <bag>']},
         weak,
         {**weak, 'garden': 'weaker', 'expected_error_m': 0.9},
+        {**weak, 'garden': 'tested', 'expected_error_m': 0.1, 'tested': tested},
+        {**weak, 'garden': 'worst', 'expected_error_m': 0.1, 'tested': {**tested, 'mean_m': 0.06}},
     ]
-    write_fleet_page(tmp_path, rows, 5, 3 * 8.64e4)
+    write_fleet_page(tmp_path, rows, 7, 3 * 8.64e4)
     text = (tmp_path / 'index.html').read_text()
     cells = [re.findall('<td>(.*?)</td>', row) for row in re.findall('<tr.*?</tr>', text)[1:]]
-    assert [row[0] for row in cells] == ['a&lt;b &amp; c', 'weaker', 'weak', 'good']
-    assert cells[0][2] == 'no &lt;bag&gt;' and set(cells[0][3:7]) == {'-'}
-    assert cells[3][3:] == ['0.10', '50', '2.0', '-0.20', '']
-    assert 'href="a%3Cb%20%26%20c/inspection/index.html"' in cells[0][7]
-    assert '4 of 5 gardens: 1 refused, 2 weak, 1 good' in text
+    order = ['a&lt;b &amp; c', 'worst', 'tested', 'weaker', 'weak', 'good']
+    assert [row[0] for row in cells] == order
+    assert cells[0][2] == 'no &lt;bag&gt;' and set(cells[0][3:9]) == {'-'}
+    assert cells[2][3:6] == ['0.05', '0.12', '0.10']
+    assert cells[5][3:] == ['-', '-', '0.10', '50', '2.0', '-0.20', '']
+    assert 'href="a%3Cb%20%26%20c/inspection/index.html"' in cells[0][9]
+    assert '6 of 7 gardens: 1 refused, 4 weak, 1 good' in text
     assert not re.search('src=|<link|http', text)

@@ -10,6 +10,7 @@ import pytest
 from metric_worlds import criss_cross, drive, garden_features, grid, lanes, meander
 from places import distances, lengths
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align, rotation
@@ -69,6 +70,22 @@ def test_forecasts_and_ellipses_are_right():
     ratios, shares = np.transpose([judged(name) for name in DRIVES])
     assert ratios.min() > 0.7 and ratios.max() < 1.5 and 0.8 < ratios.mean() < 1.25
     assert 0.91 < shares.mean() < 0.985
+
+
+@pytest.mark.parametrize('name', DRIVES)
+def test_at_no_place_more_error_is_expected_than_images_show_there(name):
+    """A corner that was driven once is far from the rest when it is left out, and only then."""
+    poses, _, features, result = trained(name)
+    images, forecast = result.images, result.forecast
+    frame = align(result.map.predict(features[images])[0], poses[images, :2])
+    rng = np.random.default_rng(4)
+    around = poses[images, :2] + rng.normal(0.0, 0.3, (5, len(images), 2))
+    predicted, _ = result.map.predict(garden_features(around.reshape(-1, 2), noise=0.05, seed=9))
+    errors = lengths(frame.apply(predicted) - around.reshape(-1, 2))
+    near = cKDTree(around.reshape(-1, 2)).query_ball_point(poses[images, :2], REACH_M)
+    true = np.array([errors[rows].mean() for rows in near])
+    for share in (50, 95, 100):
+        assert 0.5 < np.percentile(forecast.local, share) / np.percentile(true, share) < 2.0, share
 
 
 def test_it_is_worst_where_the_images_mislead(monkeypatch):

@@ -99,6 +99,9 @@ def test_each_fault_is_found_with_its_size_and_named(name, seed):
     assert health.well < 1 - LIKELY
     assert health.fault == fault and abs(health.size - size) < 0.25 * max(abs(size), 1.0)
     assert said in health.problems[0] and len(health.problems) == 1
+    (busy,) = health._replace(waited_s=3.0).problems
+    expected = 'messages have waited 3.0 s: this computer is too busy'
+    assert busy == (expected if fault == 'late' else health.problems[0])
 
 
 @pytest.mark.parametrize('camera', [

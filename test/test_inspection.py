@@ -12,9 +12,11 @@ import pytest
 from cylinder_worlds import PICTURES, Spheres, recipe, run_in, wander
 from real_cameras import STEP_DEG, desk_mirror, ordinary, street
 
+from sfa_localization.bags.drives import ReadingRecipe
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera import kinds
 from sfa_localization.camera.leveling import tilted
+from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.cli import main
 from sfa_localization.inspection import (
     SAMPLES,
@@ -119,6 +121,30 @@ def test_it_gives_the_reason_why_a_drive_is_not_enough(options, reason, tmp_path
     assert f'not enough to train on: {report.lacks[0]}' in report.as_text()
 
 
+def test_a_camera_that_is_described_may_look_like_any_other(tmp_path):
+    bag, text = write(tmp_path / 'bag', shape=(48, 64)), 'do not show all directions'
+    described = ReadingRecipe(camera=CameraConfig(camera_model='panorama'))
+    assert text in ' '.join(inspect(bag).lacks)
+    assert text not in ' '.join(inspect(bag, recipe=described).lacks)
+
+
+def test_findings_are_printed_before_a_report_that_cannot_be_written_is_an_error(tmp_path, capsys):
+    bag = write(tmp_path / 'bag', pictures=150)
+    (tmp_path / 'file').write_text('no folder')
+    assert main(['inspect', str(bag), '--report', str(tmp_path / 'file' / 'report')]) == 1
+    told = capsys.readouterr()
+    assert '/odom (Odometry): 150 messages' in told.out and 'report' in told.err
+
+
+def test_the_exit_code_tells_a_drive_that_is_not_enough_from_one_that_cannot_be_read(tmp_path):
+    bag = str(write(tmp_path / 'bag'))
+    codes = [
+        main(['inspect', *words])
+        for words in ([bag], [bag, '--min-pictures', '9999'], [str(tmp_path / 'none')])
+    ]
+    assert codes == [0, 3, 1]
+
+
 def lanes(apart, side):
     """Poses along lanes over a square, and straight back over all of them."""
     across = np.repeat(np.arange(0, side + 1e-9, apart), 2)
@@ -144,9 +170,9 @@ def test_several_bags_are_judged_together(tmp_path, capsys):
     told = tmp_path / 'told.json'
     for words, code, verdict in (
         (bags, 0, 'together: enough to train on'),
-        ([*bags, '--min-pictures', '402'], 1, 'together not enough: 401 images with odometry are'),
-        ([*dark, '--json', str(told)], 1, f'together not enough: {dark[0]}, {dark[1]}: the images'),
-        ([bags[0], bags[0]], 1, f'{bags[0]} and {bags[0]} are the same drive'),
+        ([*bags, '--min-pictures', '402'], 3, 'together not enough: 401 images with odometry are'),
+        ([*dark, '--json', str(told)], 3, f'together not enough: {dark[0]}, {dark[1]}: the images'),
+        ([bags[0], bags[0]], 3, f'{bags[0]} and {bags[0]} are the same drive'),
     ):
         spacing = ['--max-spacing', '2.0']
         assert main(['inspect', *words, *spacing]) == code

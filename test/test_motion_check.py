@@ -14,8 +14,9 @@ from metric_worlds import criss_cross, drive, lanes, meander
 from page_tables import ROOT
 from places import as_complex, distances
 
-from sfa_localization.bags.drives import read_drive
+from sfa_localization.bags.drives import ReadingRecipe, read_drive
 from sfa_localization.bags.writer import BagWriter
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import CameraError, DataError
 from sfa_localization.data.geometry import align, wrap_angle
@@ -148,7 +149,16 @@ def test_the_check_is_in_the_report_and_stops_the_training(sample, tmp_path, cap
     checked(wrong, force=True)
     assert text in caplog.text
     # Columns may grow counterclockwise.
-    assert inspected(wrong, tmp_path / 'counter', clockwise=False).lacks == []
+    counter = ReadingRecipe(panorama=PanoramaConfig(clockwise=False))
+    assert inspected(wrong, tmp_path / 'counter', recipe=counter).lacks == []
+
+
+def test_inspect_sees_the_panoramas_that_training_makes(sample, tmp_path):
+    """Of a camera that hangs upside down."""
+    hanging = showing(sample, lambda image: image[::-1, ::-1])
+    assert 'images turn opposite' in inspected(hanging, tmp_path / 'a').lacks[0]
+    mounted = ReadingRecipe(camera=CameraConfig(mount_rpy=(180.0, 0.0, 0.0)))
+    assert inspected(hanging, tmp_path / 'b', recipe=mounted).lacks == []
 
 
 def test_two_views_side_by_side_are_no_panorama(sample, tmp_path):

@@ -3,6 +3,7 @@
 """The package as a whole: imports between rooms, one version, what is installed, exit codes."""
 
 import ast
+import re
 import runpy
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import setuptools
 from page_tables import ROOT
 
 import sfa_localization
-from sfa_localization import cli
+from sfa_localization import cli, training
 from sfa_localization.cli import COMMANDS, EXECUTABLES
 from sfa_localization.nodes.process import NODES
 
@@ -48,6 +49,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'metric': ({'data', 'keyframes', 'motion'}, NUMERIC),
     'mapping': ({'data', 'sfa', 'keyframes', 'motion', 'metric'}, NUMERIC),
     'place_model': ({'data', 'camera', 'sfa', 'keyframes', 'mapping'}, {'numpy'}),
+    'library': ({'data', 'camera', 'bags', 'place_model'}, set()),
     'observer': ({'data', 'camera', 'keyframes', 'place_model'}, {'numpy'}),
     'localizer': ({'data', 'camera', 'fusion', 'place_model', 'observer'}, set()),
     'simulation': ({'data', 'camera', 'bags'}, NUMERIC | {'cv2', 'trimesh', 'embreex'}),
@@ -58,7 +60,10 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'updating': (CORE - METHOD | {'place_model', 'observer', 'localizer'}, NUMERIC),
     'inspection': (CORE - {'sfa'}, NUMERIC | {'cv2'}),
     'filtering': ({'data', 'fusion'}, {'numpy'}),
-    'reports': ({'data', 'camera', 'training', 'inspection'} | METHOD, {'numpy', 'matplotlib'}),
+    'reports': (
+        {'data', 'camera', 'training', 'inspection'} | METHOD,
+        {'numpy', 'matplotlib', 'PIL'},  # PIL comes with matplotlib
+    ),
     'nodes': (
         {'data', 'camera', 'fusion', 'bags', 'mapping', 'place_model', 'observer', 'config'},
         {'numpy', 'yaml', 'nav2_msgs'} | ROS,  # nav2_msgs where it is installed
@@ -220,10 +225,20 @@ def test_pip_installs_a_command_and_the_nodes_and_colcon_all_commands():
         assert not [name for name in arguments['packages'] if 'test' in name or 'study' in name]
 
 
+def test_the_environment_of_the_tests_has_all_extras():
+    """So that no test is skipped but those of a ROS installation."""
+    needed = set(setup_arguments()['extras_require']) - {'ros', 'kilted'}
+    script = (ROOT / '.ci/env').read_text('utf-8')
+    for line in re.findall(r'extras=(\S+)', script):
+        assert needed <= set(line.split(','))
+
+
 MAIN = 'from sfa_localization import cli\ntry: cli.main({})\nexcept SystemExit: pass'
 
 
 @pytest.mark.parametrize(('code', 'unwanted'), [
+    ('import sfa_localization', {'numpy', f'{NAME}.library', f'{NAME}.place_model'}),
+    ('from sfa_localization import PlaceModel', {'mdp', 'rosbags', 'filterpy', 'matplotlib'}),
     ('import sfa_localization.fusion.pose_filter', {'cv2', 'mdp', 'rosbags'}),
     ('import sfa_localization.camera.panorama', {'scipy', 'filterpy', 'mdp', 'matplotlib'}),
     ('import sfa_localization.observer', {'filterpy', 'mdp', 'trimesh', 'rosbags'}),
@@ -309,3 +324,9 @@ def test_ctrl_c_while_a_command_is_imported_prints_a_line(monkeypatch, capsys):
         monkeypatch.setattr(cli.importlib, 'import_module', mock.Mock(side_effect=error))
         assert cli.main(words) == 130
         assert capsys.readouterr().err == 'interrupted\n'
+
+
+def test_a_training_that_is_interrupted_says_how_to_go_on(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(training, 'train', mock.Mock(side_effect=KeyboardInterrupt))
+    assert cli.main(['train', 'bag', '--output', str(tmp_path / 'model.npz')]) == 130
+    assert capsys.readouterr().err.startswith('interrupted: the same command with --resume')

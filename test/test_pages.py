@@ -5,6 +5,8 @@
 import base64
 import html
 import itertools
+import json
+import logging
 import re
 from dataclasses import replace
 from types import SimpleNamespace
@@ -19,17 +21,22 @@ from test_inspection import write as write_drive
 
 from sfa_localization.bags.drives import images_at
 from sfa_localization.cli import main
+from sfa_localization.commands.options import noticed
 from sfa_localization.data.run import Trajectory
 from sfa_localization.reports import evaluation, page, training
 
 FOREIGN = re.compile(r'<(script|link|iframe)|href=|srcset=|onload=|onclick=|url\(|@import')
-IMAGE = re.compile(r'<img[^>]* src="data:image/png;base64,([^"]+)"[^>]*>')
+LARGEST = 1_500_000
+"""Bytes of a page."""
+PREFIX = re.compile('^(note|problem|corrected|not enough to train on|error|together not enough): ')
+IMAGE = re.compile(r'<img[^>]* src="data:image/webp;base64,([^"]+)"[^>]*>')
 
 
 def read(folder):
     """Headings, images and text of a page, which needs no other file, and is legible on a phone."""
     text = (folder / page.PAGE).read_text('utf-8')
-    assert 'viewport' in text and not FOREIGN.search(text)
+    assert 'viewport' in text and 'prefers-color-scheme: dark' in text and not FOREIGN.search(text)
+    assert len(text) < LARGEST and text.count('<table') == text.count('<div class="wide"><table')
     for tag in ('h2', 'p', 'table', 'tr', 'td', 'figure', 'div'):
         assert len(re.findall(f'<{tag}[ >]', text)) == text.count(f'</{tag}>'), tag
     raw = [np.frombuffer(base64.b64decode(data), np.uint8) for data in IMAGE.findall(text)]
@@ -83,11 +90,35 @@ def test_the_answer_about_a_map_follows_its_figures(reported):
         grade, sentence = training.judgment(changed)
         assert grade == level and why in sentence
         assert training.trust_lines(changed)[0].startswith('NOT proven') != quality['certified']
+        told = training.summary(changed)
+        assert ('position: expect' in told) == (why != 'show'), 'no error of a useless map'
     sparse = replace(result.metric, poses=5 * result.metric.poses)
     assert 'm apart' in training.judgment(replace(result, metric=sparse))[1]
     places = result.metric.poses[:, :2]
     near, far = (' '.join(training.advice(result, k * places)) for k in (1, 30))
     assert 'drive lanes 2 m apart' in far and 'lanes' not in near
+
+
+def test_a_useless_map_has_no_weak_places(reported, tmp_path):
+    result, _, _ = reported
+    useless = replace(result, model=replace(result.model, quality={**result.model.quality,
+                                                                   'explained': 0.3}))  # fmt: skip
+    warnings = ['drive: the camera leans <by> 7 degrees', training.summary(useless).splitlines()[1]]
+    training.write_training_report(tmp_path, useless, warnings=warnings)
+    content = read(tmp_path)
+    assert 'The map cannot be used' in content.text and 'Where is it weak?' not in content.headings
+    assert 'expect' not in content.text.split('What do I drive next?')[0]
+    assert page.NOTICED in content.headings and content.text.count(warnings[0]) == 1
+    assert content.text.count(warnings[1]) == 1, 'not twice'
+
+
+def test_what_is_warned_of_is_kept_and_printed_once(capsys):
+    logger = logging.getLogger('sfa_localization.test')
+    with noticed() as outer, noticed() as warnings:
+        logger.warning('%s leans', 'it')
+        logger.info('a lens')
+    logger.warning('later')
+    assert outer == warnings == ['it leans']
 
 
 @pytest.fixture
@@ -129,6 +160,8 @@ def test_the_page_of_an_evaluation(judged, tmp_path):
         '2 times measurement: outside the gate', 'aligned on a drive',
     ):  # fmt: skip
         assert words in content.text, 'escaped, and read back'
+    text = (tmp_path / page.PAGE).read_text('utf-8')
+    assert text.count('class="wide broad"') == 2, 'overview and errors'
 
 
 def test_the_answer_about_a_drive_follows_its_figures(judged):
@@ -150,17 +183,49 @@ def test_the_answer_about_a_drive_follows_its_figures(judged):
         assert words in text and (grade == page.GOOD) == (ratio < 2)
 
 
-def test_the_page_of_an_inspection(tmp_path):
-    """And of a bag that cannot be read."""
-    write_drive(tmp_path / 'few', pictures=100)
+def test_the_page_of_an_inspection(tmp_path, capsys):
+    """And of a bag that cannot be read; it says all that the terminal says."""
+    robot = (4, 10, 25, 40)
+    write_drive(tmp_path / 'few', pictures=100, shape=(12, 60), body=[robot])
     words = ['inspect', str(tmp_path / 'few'), str(tmp_path / 'none')]
     assert main([*words, '--report', str(tmp_path / 'report')]) == 1
     content = read(tmp_path / 'report')
+    told = capsys.readouterr()
+    assert 'shows the robot' in told.out and 'compared  ' in told.out
+    for line in f'{told.err}{told.out}'.splitlines()[:-1]:  # the last names the page
+        line = PREFIX.sub('', line.strip())
+        for cell in re.split(r'  +| \(\w+\): | messages, | Hz$', line):
+            assert cell.removeprefix(f'{tmp_path}/') in content.text, line
     for name in ('few', 'none'):
         assert f'{name} is not enough to train on yet.' in content.text
     assert '100 images with odometry are few: drive until there are 300' in content.text
-    assert content.headings[:2] == ['What do I drive or change next?', 'What is in it?']
+    assert content.headings[:3] == [
+        'Are they enough together?', 'What do I drive or change next?', 'What is in it?'
+    ]  # fmt: skip
     assert len(content.images) == 2
+
+
+def results(mean, grade='good'):
+    row = {'mean': mean, 'p95': 2 * mean, 'max': 0.5}
+    return {'odometry': row, 'ekf': {**row, 'max': None}, 'grade': grade, 'sentence': f'{mean} <m>'}
+
+
+def test_two_evaluations_are_shown_side_by_side(tmp_path, capsys):
+    files = [tmp_path / 'before.json', tmp_path / 'after.json']
+    for file, result in zip(files, (results(0.1), results(0.04, 'weak')), strict=True):
+        file.write_text(json.dumps(result))
+    words = ['evaluate', *map(str, files)]
+    assert main([*words, '--report', str(tmp_path / 'report')]) == 0
+    told, content = capsys.readouterr().out, read(tmp_path / 'report')
+    cells = ['0.100', '0.040', '0.200', '0.080', '-', '-']
+    (row,) = (line for line in told.splitlines() if line.startswith('| EKF'))
+    assert [cell.strip() for cell in row.split('|')[2:-1]] == cells
+    assert 'second: 0.04 <m>' in told and 'after.json: 0.04 <m>' in content.text
+    assert all(cell in content.text for cell in cells)
+    files[1].write_text('{"ekf": {"mean": 1}}')
+    assert main(words) == 1
+    error = capsys.readouterr().err
+    assert error == f'error: {files[1]}: holds no results: write them by evaluate --json\n'
 
 
 def path(seconds, poses):

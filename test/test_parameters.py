@@ -207,6 +207,8 @@ def test_an_invalid_file_is_rejected_with_its_name_and_the_reason(loader, tmp_pa
         if (text, why) in NO_YAML:
             with pytest.raises(CameraError, match=why):
                 read_calibration(path)
+    powers = '[4e-09, -1E+3, .5e2, 2.e-1, 1.5e-3, e5, 0x1e5, 1e5 m]'
+    assert load_yaml(powers) == [4e-9, -1e3, 50.0, 0.2, 1.5e-3, 'e5', 0x1E5, '1e5 m']
     shared = 'a: &x {k: 1}\nb: *x\nc: {<<: *x, <<: {m: 2}}\n'
     assert load_yaml(shared)['c'] == {'k': 1, 'm': 2} and load_yaml('') is None
 

@@ -18,6 +18,7 @@ from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import integrate
 from sfa_localization.fusion.ekf import Ekf, replaced
+from sfa_localization.fusion.health import MISSING
 from sfa_localization.fusion.motion import DELAY, LOSS, SCALE, SIZE, Pace, Twist
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
@@ -179,6 +180,9 @@ def test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed(ahead
     where = 'behind' if ahead_s < 0 else 'ahead of'
     said = f'images are stamped {abs(ahead_s):.1f} s {where} the odometry'
     assert said in ' '.join(fused.status.reasons)
+    fused.waited_s = 2.0  # of a program that has no time for its messages
+    assert 'stamped' not in ' '.join(fused.status.reasons)
+    fused.waited_s = 0.0
     # Once the clocks agree, all is forgotten.
     fused.add_measurement(int(drive.stamps_ns[-1]) + 1, drive.poses[-1, :2], np.eye(2) * 1e-2)
     assert 'stamped' not in ' '.join(fused.status.reasons)
@@ -202,8 +206,33 @@ def test_turns_show_by_how_much_images_are_stamped_late(late_s):
     if abs(late_s) > 0.5:
         assert fused.status.level is not Level.LOCALISED
         assert 'synchronize the clocks' in ' '.join(fused.status.reasons)
+        fused.waited_s = 2.0
+        assert 'synchronize the clocks' not in ' '.join(fused.status.reasons)
+        assert 'this computer is too busy' in ' '.join(fused.status.reasons)
     else:
         assert np.mean(errors[-500:]) < 0.15 and fused.status.level is Level.LOCALISED
+
+
+def test_where_odometry_is_lost_no_other_fault_is_named():
+    """As on a computer that is too busy, whose queues overflow: half of each five seconds."""
+    drive, fused, said = FilterDrive(seconds=45, rate_hz=25, every=4, **NOISY), started(), set()
+    for stamp_ns, kind, index in drive.events():
+        if kind or (stamp_ns - drive.stamps_ns[0]) % (5 * SECOND) > 2.4 * SECOND:
+            drive.give(fused, (stamp_ns, kind, index), True)
+            said.update(fused.status.reasons)
+    assert MISSING in said
+    named = 'stamped', 'the camera', 'skid', 'times as far', 'different motions'
+    assert [text for text in said if any(word in text for word in named)] == []
+
+
+def test_messages_that_waited_show_no_clock():
+    drive, fused = FilterDrive(seconds=60, rate_hz=25, every=4, **NOISY), PoseFilter()
+    fused.waited_s = 1.0
+    for stamp_ns, kind, index in drive.events():
+        if kind:
+            drive.give_turned(fused, stamp_ns + SECOND // 4, index)
+        drive.give(fused, (stamp_ns, kind, index))
+    assert not fused.camera_clock.is_estimated
 
 
 @pytest.mark.parametrize('ahead_s', [37, -18.0, -3600.5, 0.2])

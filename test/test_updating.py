@@ -17,6 +17,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.run import Odometry
 from sfa_localization.place_model import PlaceModel
+from sfa_localization.reports.update import write_update_report
 from sfa_localization.updating import Additions, extended, new_views, usual_explained
 
 
@@ -70,6 +71,19 @@ def test_what_a_changed_place_adds_lies_where_it_was_seen():
     distances = np.hypot(*(new.poses[:, :2] - truth.apply(at[:, :2])).T)
     assert np.percentile(distances, 95) < 2 * updating.CERTAIN_M
     assert np.abs(wrap_angle(new.poses[:, 2] - truth.apply_yaw(at[:, 2]))).max() < 0.1
+
+
+def test_the_page_of_an_update_shows_what_each_drive_added(tmp_path):
+    _, new, later = updated()
+    again = extended(later, Additions(new.textures[:5], new.poses[:5]), 'a <later> $one')
+    keyframes = updating.Updated(again, ()).keyframes
+    write_update_report(tmp_path, 'model.npz', 'added as keyframes', keyframes)
+    text = (tmp_path / 'index.html').read_text()
+    first = int(again.keyframes.first.sum())
+    for line in (f'training: {first}', f'later: {len(new)}', 'a &lt;later&gt; $one: 5'):
+        assert f'<li>{line} keyframes</li>' in text
+    assert 'added as keyframes' in text and text.count('<img ') == 1
+    assert_allclose(keyframes[2][1], new.poses[:5])
 
 
 def textures_of(run):

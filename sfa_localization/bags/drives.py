@@ -161,7 +161,7 @@ def read_drive(
     with Bag(path, strict=strict, config=recipe.bag) as bag:
         name = bag.find('image', recipe.topics.image)
         try:
-            stored = _PanoramaFile(Path(cache), recipe, _is_ready(bag, name))
+            stored = _PanoramaFile(Path(cache), recipe, unwrapper_of(bag, name, recipe))
             streams = {'images': bag.stream(name, stored.panorama)}
             streams |= _other_streams(bag, recipe, want_truth)
             _collect(bag, streams, stored, progress)
@@ -200,22 +200,25 @@ def _measured(
     return origin, points
 
 
-def _is_ready(bag: Bag, topic: str) -> bool:
-    """Whether images are of omnicam_node, which mounts and masks them and publishes its info."""
-    return f'{topic.removesuffix("/compressed")}/info' in bag.topics
+def unwrapper_of(bag: Bag, topic: str, recipe: ReadingRecipe) -> Unwrapper:
+    """What makes panoramas of the images of a topic. Those of omnicam_node, which publishes its
+    info, are mounted and masked already. Raises CameraError for a lens that cannot be used.
+    """
+    unwrapper = recipe.unwrapper
+    unwrapper.check()
+    if f'{topic.removesuffix("/compressed")}/info' not in bag.topics:
+        return unwrapper
+    masked = CameraConfig(blind_sectors=recipe.camera.blind_sectors)
+    return Unwrapper(masked, recipe.panorama)
 
 
 class _PanoramaFile:
     """Makes panoramas of one size, and stores them in a temporary file."""
 
-    def __init__(self, folder: Path, recipe: ReadingRecipe, is_ready: bool) -> None:
+    def __init__(self, folder: Path, recipe: ReadingRecipe, unwrapper: Unwrapper) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as the run
-        self._unwrap = recipe.unwrapper
-        self._unwrap.check()
-        if is_ready:
-            masked = CameraConfig(blind_sectors=recipe.camera.blind_sectors)
-            self._unwrap = Unwrapper(masked, recipe.panorama)
+        self._unwrap = unwrapper
         self._watch = FrozenWatch() if recipe.distinct else None
         self.repeats = 0
         self._shape: tuple[int, ...] = ()

@@ -5,14 +5,18 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.commands import options
-from sfa_localization.data.files import write_json
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.files import read_text, write_json
 from sfa_localization.data.geometry import RigidTransform
+from sfa_localization.data.plain_yaml import LONGEST
 from sfa_localization.fusion.settings import FilterConfig
 
 if TYPE_CHECKING:
@@ -21,17 +25,20 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 WRITES = """\
 tables on standard output; with --report index.html (one page for a browser) and its figures;
-  with --json the grade (good, weak or bad), a sentence, and the errors"""
+  with --json the grade (good, weak or bad), a sentence, and the errors; with --tum paths for evo"""
 EXAMPLES = """\
   evaluate garden.npz bags/test --align bags/coverage
   evaluate garden.npz bags/test --align none
-  evaluate garden.npz bags/test --align bags/coverage --report report --json results.json"""
+  evaluate garden.npz bags/test --align bags/coverage --report report --json results.json
+  evaluate before.json after.json --report report"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add model, bags, topics and outputs."""
-    parser.add_argument('model', type=Path, metavar='MODEL.npz')
-    parser.add_argument('bag', type=Path, metavar='BAG', help='drive with ground truth')
+    parser.add_argument('model', type=Path, metavar='MODEL.npz', help='or results, as JSON')
+    parser.add_argument(
+        'bag', type=Path, metavar='BAG', help='drive with ground truth; or other results, as JSON'
+    )
     parser.add_argument(
         '--align',
         type=Path,
@@ -49,6 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--report', type=Path, metavar='DIR', help='write figures and the table')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the errors as JSON')
+    parser.add_argument(
+        '--tum', type=Path, metavar='DIR', help='write truth and estimates in the format of TUM'
+    )
     options.add_topics(parser, 'image', 'odometry', 'imu', 'ground_truth')
 
 
@@ -56,8 +66,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Evaluate; print the errors, and counts of used and rejected inputs."""
     from sfa_localization import evaluation
     from sfa_localization.place_model import PlaceModel
-    from sfa_localization.reports.evaluation import count_lines, judgment, tables, trust_lines
+    from sfa_localization.reports.evaluation import count_lines, tables, trust_lines
 
+    if arguments.model.suffix == arguments.bag.suffix == '.json':
+        return _compare(arguments)
     align = arguments.align
     transform = None
     if [str(path) for path in align] == ['none']:
@@ -69,34 +81,80 @@ def run(arguments: argparse.Namespace) -> int:
     options.require_report(arguments.report, arguments.json)
     model = PlaceModel.load(arguments.model)
     options.require_same_panorama(arguments.config, model.panorama)
-    if transform is not None and not model.quality.get('points'):
-        logger.warning(
-            '%s: its map has no measured points, so that its coordinates are its own: train with '
-            '--points or --points-topic, or evaluate with --align TRAIN_BAG', arguments.model,
-        )  # fmt: skip
-    result = evaluation.evaluate(
-        model,
-        arguments.bag,
-        align_bags=align,
-        recipe=options.recipe(arguments),
-        config=options.settings(FilterConfig, arguments),
-        watch=options.settings(WatchConfig, arguments),
-        progress=True,
-        smooth=arguments.smooth,
-        transform=transform,
-    )
+    with options.noticed() as warnings:
+        if transform is not None and not model.quality.get('points'):
+            logger.warning(
+                '%s: its map has no measured points, so that its coordinates are its own: train '
+                'with --points or --points-topic, or evaluate with --align TRAIN_BAG',
+                arguments.model,
+            )
+        result = evaluation.evaluate(
+            model,
+            arguments.bag,
+            align_bags=align,
+            recipe=options.recipe(arguments),
+            config=options.settings(FilterConfig, arguments),
+            watch=options.settings(WatchConfig, arguments),
+            progress=True,
+            smooth=arguments.smooth,
+            transform=transform,
+        )
     print(tables(result.scores), *trust_lines(result.scores), sep='\n')
     print(*count_lines(result.counts), sep='\n')
     print(f'aligned on {result.aligned_on}', *result.corrections, sep='\n')
-    if arguments.report:
-        _write_report(arguments, result)
-    if arguments.json:
-        grade, sentence = judgment(result.scores, result.counts)
-        write_json(arguments.json, {**result.as_dict(), 'grade': grade, 'sentence': sentence})
+    _write_files(arguments, result, warnings)
     return 0
 
 
-def _write_report(arguments: argparse.Namespace, result: Evaluation) -> None:
+def _write_files(
+    arguments: argparse.Namespace, result: Evaluation, warnings: Sequence[str]
+) -> None:
+    """Write what was asked for, the report last."""
+    from sfa_localization.filtering import write_trajectory
+    from sfa_localization.reports.evaluation import judgment
+
+    if arguments.json:
+        grade, sentence = judgment(result.scores, result.counts)
+        write_json(arguments.json, {**result.as_dict(), 'grade': grade, 'sentence': sentence})
+    for name, path in {'truth': result.truth, **result.estimates}.items() if arguments.tum else ():
+        write_trajectory(path, arguments.tum / f'{name}.tum')
+    if arguments.report:
+        _write_report(arguments, result, warnings)
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    """Print two results side by side. Raises DataError."""
+    from sfa_localization.reports.comparison import comparison_text, write_comparison_page
+    from sfa_localization.reports.page import PAGE, begin_page
+
+    files = arguments.model, arguments.bag
+    options.require_report(arguments.report, None)
+    results = [_results(file) for file in files]
+    print(comparison_text(*results))
+    if folder := arguments.report:
+        begin_page(folder)
+        write_comparison_page(folder, [file.name for file in files], results)
+        print(f'{folder / PAGE}: written')
+    return 0
+
+
+def _results(file: Path) -> dict[str, Any]:
+    """What `evaluate --json` has written. Raises DataError."""
+    from sfa_localization.reports.fleet import STATES
+
+    try:
+        results = dict(json.loads(read_text(file, LONGEST, DataError)))
+        means = [results[name]['mean'] for name in ('odometry', 'ekf')]
+    except (ValueError, TypeError, KeyError):
+        means = []
+    if not means or 'sentence' not in results or results.get('grade') not in STATES:
+        raise DataError(f'{file}: holds no results: write them by evaluate --json')
+    return results
+
+
+def _write_report(
+    arguments: argparse.Namespace, result: Evaluation, warnings: Sequence[str]
+) -> None:
     """Write figures and the page; the worst images are read from the bag again."""
     from sfa_localization.bags.drives import images_at
     from sfa_localization.reports.evaluation import worst_of, write_evaluation_page, write_report
@@ -112,6 +170,6 @@ def _write_report(arguments: argparse.Namespace, result: Evaluation) -> None:
     read = images_at(arguments.bag, stamps.values(), options.recipe(arguments))
     samples = {image: read[stamp] for image, stamp in stamps.items() if stamp in read}
     title = f'{arguments.model.name} on {arguments.bag.name}'
-    notes = f'The map is aligned on {result.aligned_on}.', *result.corrections
+    notes = f'The map is aligned on {result.aligned_on}.', *result.corrections, *warnings
     write_evaluation_page(folder, title, *drive, result.counts, samples, notes)
     print(f'{folder / PAGE}: written')

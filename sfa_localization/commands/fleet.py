@@ -22,7 +22,7 @@ from sfa_localization.commands import options
 from sfa_localization.data.errors import ConfigError, LocalizationError
 from sfa_localization.data.files import read_text, write_json
 from sfa_localization.data.plain_yaml import LONGEST, load_yaml
-from sfa_localization.data.progress import progress_bar
+from sfa_localization.data.progress import LOG_PERIOD_S, progress_bar
 
 if TYPE_CHECKING:
     from sfa_localization.commands.garden import Garden
@@ -162,7 +162,10 @@ def _work_on(gardens: Sequence[Garden], place: Place, total: int) -> None:
                 garden = waiting.popleft()
                 running[submit(work, garden)] = garden
             bar.set_description_str(f'running {len(running)}, refused {refused}', refresh=False)
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
+            done = wait(running, LOG_PERIOD_S, FIRST_COMPLETED).done
+            if not done:
+                bar.refresh()
+            for future in done:
                 garden = running.pop(future)
                 if _has_failed(future) and garden not in failed:
                     failed.add(garden)

@@ -113,7 +113,9 @@ def work(garden: Garden) -> str:
         try:
             training, *updates = _learn(garden, result, inputs)
             model = PlaceModel.load(garden.model)
-            judgments = [training, *updates, *_evaluate(garden, 'points' in model.quality)]
+            tests = _evaluate(garden, 'points' in model.quality)
+            judgments = [training, *updates, *tests]
+            result['tested'] = _tested(tests)
             error_m = model.quality['expected_error_m']
             result['change_m'] = error_m - result.get('expected_error_m', error_m)
             result['expected_error_m'] = error_m
@@ -147,8 +149,12 @@ def _learn(garden: Garden, before: Mapping[str, Any], inputs: Mapping[str, Any])
     if not useful or changed - {TESTS, *(drive.name for drive in added)}:
         return [_train(garden, config)]
     words = *config, '--update', garden.model, '--output', garden.model
-    updates = [_attempt(train, garden.output / 'update.json', drive, *words) for drive in added]
-    return [_read_json(garden.output / TRAINING), *updates]
+    judgments: list[Judgment] = [_read_json(garden.output / TRAINING)]
+    for drive in added:
+        page = garden.output / f'update_{drive.name}'
+        report = *words, '--report', page
+        judgments.append(_attempt(train, garden.output / 'update.json', drive, *report))
+    return judgments
 
 
 def _train(garden: Garden, config: Sequence[Path | str]) -> Judgment:
@@ -182,6 +188,17 @@ def _evaluate(garden: Garden, has_points: bool) -> list[Judgment]:
         report = *words, '--report', page
         judgments.append(_attempt(evaluate, page / 'scores.json', bag, garden.model, *report))
     return judgments
+
+
+def _tested(tests: Sequence[Judgment]) -> dict[str, float]:
+    """Mean, 95th percentile and maximum (m) of the filter's errors on the test drive with the
+    largest mean; {} without any.
+    """
+    scores = [test['ekf'] for test in tests if test.get('ekf') and test['ekf']['mean'] is not None]
+    if not scores:
+        return {}
+    worst = max(scores, key=lambda score: float(score['mean']))
+    return {f'{name}_m': worst[name] for name in ('mean', 'p95', 'max')}
 
 
 def _attempt(command: ModuleType, file: Path, bag: Path, *words: Path | str) -> Judgment:

@@ -9,8 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sfa_localization.bags.settings import TopicNames
-from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.bags.drives import ReadingRecipe
 from sfa_localization.commands import options
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.files import write_json
@@ -18,7 +17,10 @@ from sfa_localization.inspection import BagReport, InspectionConfig, inspect, la
 
 WRITES = """\
 findings on standard output; with --report index.html (one page for a browser) and its
-  figures; with --json the findings"""
+  figures; with --json the findings. Exit code 1: a bag or topic cannot be read; 3: not enough to
+  train on"""
+NOT_ENOUGH = 3
+"""Exit code where all is readable, but not enough to train on."""
 EXAMPLES = """\
   inspect bags/coverage bags/test
   inspect recording_0.mcap --json bag.json --report report
@@ -43,47 +45,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Inspect all bags, each alone, also after an unreadable one, and all together."""
-    topics = options.settings(TopicNames, arguments)
+    recipe = options.recipe_of(ReadingRecipe, arguments)
     config = options.settings(InspectionConfig, arguments)
-    reading = {
-        'clockwise': options.settings(PanoramaConfig, arguments).clockwise,
-        'camera': options.settings(CameraConfig, arguments),
-        'strict': arguments.strict,
-    }
     if arguments.json:
         options.require_output(arguments.json, arguments.bags, '.json')
     options.require_report(arguments.report, arguments.json)
     reports = []
     for path in arguments.bags:
         try:
-            reports.append(inspect(path, topics=topics, config=config, **reading))
+            reports.append(inspect(path, recipe=recipe, config=config, strict=arguments.strict))
         except BagError as error:
             reports.append(BagReport(str(path), error=str(error)))
     lacks = lacks_together(reports, config)
-    if arguments.json:
-        together = {'enough_to_train_on': not lacks, 'lacks': lacks}
-        bags = [report.as_dict() for report in reports]
-        write_json(arguments.json, {'bags': bags, 'together': together})
-    if arguments.report:
-        _write_report(arguments.report, reports)
     for report in reports:
         print(report.as_text(), file=sys.stderr if report.error else sys.stdout)
-    if len(reports) > 1:
-        verdicts = [f'together not enough: {lack}' for lack in lacks]
-        print(*(verdicts or ['together: enough to train on']), sep='\n')
-        if lacks:
-            return 1
-    return int(any(r.error or any(topic.unreadable for topic in r.topics) for r in reports))
+    together = [f'together not enough: {lack}' for lack in lacks]
+    together = (together or ['together: enough to train on']) if len(reports) > 1 else []
+    print(*together, sep='\n', end='\n' if together else '')
+    sys.stdout.flush()  # the findings, before an error in writing them
+    if arguments.json:
+        bags = [report.as_dict() for report in reports]
+        all_bags = {'enough_to_train_on': not lacks, 'lacks': lacks}
+        write_json(arguments.json, {'bags': bags, 'together': all_bags})
+    if arguments.report:
+        _write_report(arguments.report, reports, together)
+    if any(report.error or any(topic.unreadable for topic in report.topics) for report in reports):
+        return 1
+    return NOT_ENOUGH if lacks else 0
 
 
-def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:
-    """Write figures of all bags, and the page that shows them."""
+def _write_report(folder: Path, reports: Sequence[BagReport], together: Sequence[str]) -> None:
+    """Write figures of all bags, and the page that shows them, with verdicts on all together."""
+    from sfa_localization.reports import page
     from sfa_localization.reports.bag import bag_sections, write_path
     from sfa_localization.reports.figures import write_contact_sheet
-    from sfa_localization.reports.page import PAGE, begin_page, write_page
 
-    begin_page(folder)
-    sections = []
+    page.begin_page(folder)
+    sections = [page.section('Are they enough together?', page.items(together))]
     for number, report in enumerate(reports):
         stem = Path(report.path).stem
         figures = dict[Path, str]()
@@ -102,5 +100,5 @@ def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:
             figures[target] = 'Images from all over the drive'
         facts = [': '.join(fact) for fact in report.facts.items()]
         sections += bag_sections(report.as_dict(), facts, figures)
-    write_page(folder, 'What is in the recording', *sections)
-    print(f'{folder / PAGE}: written')
+    page.write_page(folder, 'What is in the recording', *sections)
+    print(f'{folder / page.PAGE}: written')

@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Iterable, Sequence
+import logging
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -18,9 +20,11 @@ from sfa_localization.data.files import first_bytes, require_outputs, resolved
 from sfa_localization.data.settings import Settings
 
 if TYPE_CHECKING:
+    from sfa_localization.bags.drives import ReadingRecipe
     from sfa_localization.training import Recipe
 
 S = TypeVar('S', bound=Settings)
+R = TypeVar('R', bound='ReadingRecipe')
 TOPIC_OPTIONS = {
     'image': '--image-topic',
     'odometry': '--odom-topic',
@@ -30,6 +34,31 @@ TOPIC_OPTIONS = {
 }
 REPORT_FILES = ('.html', '.md', '.png')
 """Kinds of files in the folder of a report."""
+
+
+class _Noticed(logging.Handler):
+    """Keeps the texts of warnings; where nothing else does, it prints them as without it."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.texts.append(record.getMessage())
+        if not logging.getLogger().handlers and logging.lastResort is not None:
+            logging.lastResort.handle(record)
+
+
+@contextmanager
+def noticed() -> Iterator[list[str]]:
+    """The warnings of the package meanwhile, for the page: it says what the terminal has said."""
+    handler = _Noticed()
+    package = logging.getLogger('sfa_localization')
+    package.addHandler(handler)
+    try:
+        yield handler.texts
+    finally:
+        package.removeHandler(handler)
 
 
 def require_output(output: Path, inputs: Iterable[Path | None], *suffixes: str) -> None:
@@ -143,13 +172,18 @@ def recipe(arguments: argparse.Namespace) -> Recipe:
     """Return the training recipe of --config and of the command line."""
     from sfa_localization.training import Recipe
 
-    default = Recipe()
-    chosen = {}
-    for item in dataclasses.fields(Recipe):
+    return recipe_of(Recipe, arguments)
+
+
+def recipe_of(kind: type[R], arguments: argparse.Namespace) -> R:
+    """Return a recipe whose groups of settings are those of --config and of the command line."""
+    default = kind()
+    chosen: dict[str, Any] = {}
+    for item in dataclasses.fields(kind):
         group = getattr(default, item.name)
         if isinstance(group, Settings):
             chosen[item.name] = settings(type(group), arguments)
-    return Recipe(**chosen)  # type: ignore[arg-type]
+    return kind(**chosen)
 
 
 def require_same_panorama(path: Path | None, trained: PanoramaConfig) -> None:

@@ -20,6 +20,7 @@ from sfa_localization.sfa.settings import NetworkConfig
 
 if TYPE_CHECKING:
     from sfa_localization.training import Recipe, Trained
+    from sfa_localization.updating import Updated
 
 WRITES = """\
 MODEL.npz; with --report index.html (one page for a browser) and its figures; with --json the
@@ -43,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='extend this model by images of new viewpoints, light or seasons, instead of training',
     )
     parser.add_argument('--config', type=Path, help='parameter file')
-    parser.add_argument('--report', type=Path, metavar='DIR', help='write figures of the training')
+    parser.add_argument('--report', type=Path, metavar='DIR', help='write a page about the model')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the judgment as JSON')
     parser.add_argument('--resume', action='store_true', help='continue an interrupted training')
     parser.add_argument('--strict', action='store_true', help='reject damaged bags')
@@ -68,27 +69,31 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization.reports.summary import judgment, summary
 
     used = options.recipe(arguments)
-    trained = training.train(
-        arguments.bags,
-        arguments.output,
-        used,
-        progress=True,
-        resume=arguments.resume,
-        strict=arguments.strict,
-        force=arguments.force,
-    )
-    print(summary(trained))
-    if arguments.report:
-        _write_report(arguments.report, arguments.bags, trained, used)
+    try:
+        with options.noticed() as warnings:
+            trained = training.train(
+                arguments.bags,
+                arguments.output,
+                used,
+                progress=True,
+                resume=arguments.resume,
+                strict=arguments.strict,
+                force=arguments.force,
+            )
+    except KeyboardInterrupt:
+        remedy = 'the same command with --resume continues from its last finished pass'
+        raise KeyboardInterrupt(remedy) from None
+    print(summary(trained), written, sep='\n')
     if arguments.json:
         _write_judgment(arguments.json, *judgment(trained), quality=trained.model.quality)
-    print(written)
+    if arguments.report:
+        _write_report(arguments, trained, used, warnings)
     return 0
 
 
 def _update(arguments: argparse.Namespace, written: str) -> int:
     """Extend a model; print what was added, and what was written."""
-    unused = [name for name in ('report', 'resume', 'force') if getattr(arguments, name)]
+    unused = [name for name in ('resume', 'force') if getattr(arguments, name)]
     for group in (SegmentConfig, MetricConfig, NetworkConfig):
         unused += options.given(group, arguments)
     if unused:
@@ -100,20 +105,23 @@ def _update(arguments: argparse.Namespace, written: str) -> int:
 
     model = PlaceModel.load(arguments.update)
     options.require_same_panorama(arguments.config, model.panorama)
-    updated = update(
-        model,
-        arguments.bags,
-        arguments.output,
-        options.recipe(arguments),
-        config=options.settings(FilterConfig, arguments),
-        watch=options.settings(WatchConfig, arguments),
-        progress=True,
-        strict=arguments.strict,
-    )
-    print(updated.sentence())
+    with options.noticed() as warnings:
+        updated = update(
+            model,
+            arguments.bags,
+            arguments.output,
+            options.recipe(arguments),
+            config=options.settings(FilterConfig, arguments),
+            watch=options.settings(WatchConfig, arguments),
+            progress=True,
+            strict=arguments.strict,
+        )
+    sentence = updated.sentence()
+    print(sentence, written, sep='\n')
     if arguments.json:
-        _write_judgment(arguments.json, GOOD, updated.sentence())
-    print(written)
+        _write_judgment(arguments.json, GOOD, sentence)
+    if arguments.report:
+        _write_update_report(arguments, updated, warnings)
     return 0
 
 
@@ -121,12 +129,30 @@ def _write_judgment(file: Path, grade: str, sentence: str, **more: Mapping[str, 
     write_json(file, {'grade': grade, 'sentence': sentence, **more})
 
 
-def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Recipe) -> None:
+def _write_update_report(
+    arguments: argparse.Namespace, updated: Updated, warnings: Sequence[str]
+) -> None:
+    """Write the page about what was added to a model."""
+    from sfa_localization.reports.page import PAGE, begin_page
+    from sfa_localization.reports.update import write_update_report
+
+    folder = arguments.report
+    begin_page(folder)
+    title = f'{arguments.update.name}, extended by {", ".join(bag.name for bag in arguments.bags)}'
+    write_update_report(folder, title, updated.sentence(), updated.keyframes, warnings)
+    print(f'{folder / PAGE}: written')
+
+
+def _write_report(
+    arguments: argparse.Namespace, trained: Trained, used: Recipe, warnings: Sequence[str]
+) -> None:
     """Write figures and the page; the worst images are read from the bags again."""
     from sfa_localization.bags.drives import images_at
     from sfa_localization.reports.page import PAGE, begin_page
     from sfa_localization.reports.training import worst_of, write_training_report
 
+    folder = arguments.report
+    bags = arguments.bags
     worst = worst_of(trained)
     read = [
         images_at(bag, [stamp for run, stamp in worst.values() if run == number], used)
@@ -134,7 +160,8 @@ def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Re
     ]
     samples = {image: read[run][at] for image, (run, at) in worst.items() if at in read[run]}
     begin_page(folder)
-    write_training_report(folder, trained, samples, _lens_picture(bags[0], trained, used))
+    lens = _lens_picture(bags[0], trained, used)
+    write_training_report(folder, trained, samples, lens, warnings)
     print(f'{folder / PAGE}: written')
 
 

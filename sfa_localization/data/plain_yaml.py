@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import re
+from functools import cache
 from typing import Any
 
 import yaml
@@ -16,6 +18,7 @@ except ImportError:  # PyYAML was built without libyaml
 LONGEST = 1 << 23
 """Characters of a text: metadata of a bag with ten thousand files."""
 _DEEPEST = 32  # levels of nesting; no file of this package or of ROS has ten
+_POWER = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$')
 
 
 def load_yaml(text: str, loader: Any = YamlLoader, *, first: bool = False) -> Any:
@@ -25,6 +28,7 @@ def load_yaml(text: str, loader: Any = YamlLoader, *, first: bool = False) -> An
     """
     if len(text) > LONGEST:
         raise ValueError(f'has {len(text)} characters, more than {LONGEST}')
+    loader = _with_powers(loader)
     try:
         _check_events(text, first)
         return next(yaml.load_all(text, loader), None) if first else yaml.load(text, loader)
@@ -36,6 +40,16 @@ def load_yaml(text: str, loader: Any = YamlLoader, *, first: bool = False) -> An
     except Exception as error:  # impossible dates and numbers fail in many ways
         why = ' '.join(str(error).split())[:200]
         raise ValueError(f'has an impossible date or number: {why}') from None
+
+
+@cache
+def _with_powers(loader: Any) -> Any:
+    """The loader, for which numbers such as 4e-09, which most programs write, are no texts, as they
+    are in YAML 1.1.
+    """
+    extended: Any = type(loader.__name__, (loader,), {})
+    extended.add_implicit_resolver('tag:yaml.org,2002:float', _POWER, [*'-+.0123456789'])
+    return extended
 
 
 def _check_events(text: str, first: bool) -> None:

@@ -21,6 +21,10 @@ from sfa_localization.data.messages import LARGEST_SCALE
 
 CAMERA_STD_M = 0.5
 """Prior of each coordinate of a camera on a robot of unknown size."""
+GIVEN_STD_M = 0.005
+"""Of a lever arm that was measured on the robot."""
+CONTRADICTS = 4.0
+"""Standard deviations: two measurements of a place never differ by so many by chance."""
 TURN_FACTOR_STD = 0.04
 """Of true over counted turns, also of a known robot on other ground: wheels of eleven real drives
 differed by so much; tracks that skid by half are known by the turns of images."""
@@ -89,6 +93,19 @@ class Rig:
     def lever(self) -> complex:
         """Lever arm of the camera, ahead + i left, m."""
         return complex(self.camera_ahead.value, self.camera_left.value)
+
+    def displaced(self, lever: complex) -> str:
+        """A sentence if a camera at a measured lever arm, ahead + i left, m, sits elsewhere than in
+        training; '' if not.
+        """
+        std = (self.camera_ahead.std + self.camera_left.std) / 2
+        if abs(lever - self.lever) < CONTRADICTS * math.hypot(std, GIVEN_STD_M):
+            return ''
+        return (
+            f'/tf_static has the camera {lever.real:.2f} m ahead and {lever.imag:.2f} m left of '
+            f'base_link, in training it was at {self.lever.real:.2f} and {self.lever.imag:.2f} m '
+            f'(+- {std:.2f}): was it moved? Train anew, or correct /tf_static'
+        )
 
     def base(self, pose: Array, covariance: Array, facing: complex) -> tuple[Array, Array]:
         """Pose (3,) and covariance (3, 3) of base_link from those of the camera.

@@ -119,6 +119,7 @@ class Update(NamedTuple):
 class PositionFix(NamedTuple):
     """What one image showed, at x + iy m and `yaw` rad (NaN where unknown), with variances m^2 per
     axis and rad^2, beside the dead-reckoned pose at its stamp. `is_new`: the robot had moved.
+    `is_reckoned`: odometry of its time had come; else the pose is a guess by the last speed.
     """
 
     stamp_ns: int
@@ -130,6 +131,7 @@ class PositionFix(NamedTuple):
     traveled_m: float
     accepted: bool = False
     is_new: bool = True
+    is_reckoned: bool = True
 
 
 def remembered(fixes: tuple[PositionFix, ...], newest: PositionFix) -> tuple[PositionFix, ...]:

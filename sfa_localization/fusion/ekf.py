@@ -31,7 +31,14 @@ from sfa_localization.fusion.belief import (
 )
 from sfa_localization.fusion.camera_clock import SIGNIFICANT_STDS
 from sfa_localization.fusion.motion import DELAY, ERROR, SIZE, YAW, MotionNoise, Step, Twist, V
-from sfa_localization.fusion.odometry import COAST_S, interval, jump, received, repeats
+from sfa_localization.fusion.odometry import (
+    COAST_S,
+    ODOMETRY_TIMEOUT_S,
+    interval,
+    jump,
+    received,
+    repeats,
+)
 from sfa_localization.fusion.relocation import Relocation, relocate
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import DEGRADED_YAW_RAD
@@ -323,6 +330,8 @@ def _fix(belief: Belief, event: MeasurementEvent) -> PositionFix:
     moving = motion.velocity(belief.mean)[: len(event.value)]
     variances = event.covariance.diagonal() + moving**2 * belief.covariance[DELAY, DELAY]
     x, y, *yaw = event.value.tolist()
+    counted_ns = belief.odometry.stamp_ns
+    limit_ns = round(ODOMETRY_TIMEOUT_S * 1e9)
     return PositionFix(
         event.stamp_ns,
         complex(x, y),
@@ -331,6 +340,7 @@ def _fix(belief: Belief, event: MeasurementEvent) -> PositionFix:
         float(variances[2]) if yaw else math.inf,
         belief.dead_reckoned,
         belief.traveled_m,
+        is_reckoned=counted_ns is not None and event.stamp_ns - counted_ns <= limit_ns,
     )
 
 

@@ -16,7 +16,7 @@ well, one rigid transform T lays the path on the images; or another hypothesis e
 The noise is that of the images and of the odometry's drift; a share of outliers lies anywhere.
 Neighboring images err alike: all together count as about one a meter. T is eliminated in closed
 form (weighted: Umeyama 1991) and by Laplace's method, tau and f by sums over grids. The filter's
-state does not depend on any of this.
+state does not depend on any of this. Where odometry is missing, d is a guess: no fault is named.
 """
 
 from __future__ import annotations
@@ -65,6 +65,7 @@ EXPECTED = 4 * TURN_FACTOR_STD
 up to a tenth, and turn on the spot."""
 LONGEST_M = 16.0
 """An estimate that was placed anew again and again is confirmed over this distance at most."""
+MISSING = 'odometry was missing while images came: is it lost, or this computer too busy?'
 _ANYWHERE = 1 / (100.0 * 2 * math.pi)
 """Density of poses anywhere in 100 m^2, 1/(m^2 rad)."""
 _TINY = 1e-9  # least weight of an image, so that some path fits best
@@ -75,7 +76,9 @@ _AHEAD_S = 0.3  # of the path: odometry may be a little behind
 class Health(NamedTuple):
     """The probability that all is `well`, and the likeliest fault with its size.
 
-    `confirmed_m` of `needed_m` were driven since the estimate was placed.
+    `confirmed_m` of `needed_m` were driven since the estimate was placed. Where messages have
+    `waited_s` for this program, they seem late, and no clock is to blame. The path `is_guess` where
+    odometry was missing for some of the images.
     """
 
     well: float
@@ -83,15 +86,31 @@ class Health(NamedTuple):
     size: complex
     confirmed_m: float
     needed_m: float
+    is_guess: bool = False
+    waited_s: float = 0.0
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether images seem late, and messages had to wait."""
+        return self.well < LIKELY and self.fault == 'late' and self.waited_s > 0
 
     @property
     def problems(self) -> list[str]:
         """Why the estimate is not trusted, in words."""
         problems = [] if self.well >= LIKELY else [_sentence(self.fault, self.size)]
+        if problems and self.is_guess:
+            problems = [MISSING]
+        if self.is_busy:
+            problems = [busy(self.waited_s)]
         if self.confirmed_m < self.needed_m:
             so_far = f'{self.confirmed_m:.1f} of {self.needed_m:.0f} m'
             problems.append(f'placed, confirmed over {so_far}: driving on confirms it')
         return problems
+
+
+def busy(waited_s: float) -> str:
+    """That messages had to wait for this program, in words."""
+    return f'messages have waited {waited_s:.1f} s: this computer is too busy'
 
 
 def _sentence(fault: str, size: complex) -> str:
@@ -127,7 +146,8 @@ def health_of(path: DrivenPath, fixes: Sequence[PositionFix]) -> Health:
     odds = np.where([each.is_harmful for each in hypotheses], odds, 0.0) / odds.sum()
     worst = hypotheses[int(np.argmax(odds))]
     well = 1 - float(odds.sum())
-    return Health(well, worst.name, complex(worst.size), confirmed_m, needed_m)
+    is_guess = not all(fix.is_reckoned for fix in fixes)
+    return Health(well, worst.name, complex(worst.size), confirmed_m, needed_m, is_guess)
 
 
 class _Hypothesis(NamedTuple):

@@ -37,7 +37,7 @@ from sfa_localization.fusion.belief import (
 )
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder, ImageClock
 from sfa_localization.fusion.ekf import Ekf
-from sfa_localization.fusion.health import Health, health_of
+from sfa_localization.fusion.health import Health, busy, health_of
 from sfa_localization.fusion.history import History
 from sfa_localization.fusion.inputs import OpenLoop, read_measurement, read_pose, read_twist
 from sfa_localization.fusion.motion import State
@@ -73,6 +73,8 @@ class PoseFilter:
         self.correlation = correlation or ErrorCorrelation()
         self.counts: Counter[str] = Counter()
         self.scale = self.config.odometry_scale
+        self.waited_s = 0.0
+        """How long messages have recently waited for this program: they show no clocks."""
         self._nis = 0.0, 0
         self._camera = CameraClockFinder(_CLOCK_MEMORY)
         self._expected_s = 0.0
@@ -245,7 +247,7 @@ class PoseFilter:
         The turns of images and odometry together show by how much the camera's stamps are late;
         images are then fused where they were taken.
         """
-        if stamp_ns <= 0 or not math.isfinite(yaw_rad):
+        if stamp_ns <= 0 or not math.isfinite(yaw_rad) or self.waited_s:
             return
         odometry_ns = self._history.newest.odometry.stamp_ns
         if odometry_ns is not None:
@@ -357,12 +359,16 @@ class PoseFilter:
         """How far the estimate at the newest message can be trusted, and why not further."""
         newest = self._newest
         clock = self._camera.clock
-        status = status_of(newest, newest.state, self.health, self.config)
-        doubts = self._timeline.problems
-        if self.odometry_in_turn:
-            doubts.append('odometry leads along two paths in turn: its poses are not used')
+        health = self.health._replace(waited_s=self.waited_s)
+        status = status_of(newest, newest.state, health, self.config)
+        of_clocks = self._timeline.problems
         if abs(clock.delay_ns) > DELAY_LIMIT_NS:
             late = 'late' if clock.delay_s > 0 else 'early'
             size = f'{abs(clock.delay_s):.1f} s {late}'
-            doubts.append(f'images are stamped {size}: synchronize the clocks')
+            of_clocks.append(f'images are stamped {size}: synchronize the clocks')
+        if of_clocks and self.waited_s:
+            of_clocks = [] if health.is_busy else [busy(self.waited_s)]
+        doubts = of_clocks
+        if self.odometry_in_turn:
+            doubts.append('odometry leads along two paths in turn: its poses are not used')
         return status.with_reasons([], doubts)

@@ -51,6 +51,10 @@ class Status:
             level = self.level
         return Status(level, (*lost, *self.reasons, *degraded))
 
+    def because(self, reason: str) -> Status:
+        """With this reason first, and DEGRADED at best."""
+        return Status(self.with_reasons([], [reason]).level, (reason, *self.reasons))
+
 
 def status_of(belief: Belief, state: State | None, health: Health, config: FilterConfig) -> Status:
     """The status of a belief with this state and health."""

@@ -111,9 +111,9 @@ def hold_out(fit: MapFit) -> HeldOut:
         errors[rows] = places[rows] - (turn * (expanded @ ridge.fitted(others)) + shift)
         by_weights = (ridge.whitened(expanded) ** 2).sum(0)
         variances[rows] = fit.variance * (1.0 / fit.ridge.weights[rows] + by_weights)
-    distances, weight = on_the_ground(fit)
+    nearest, distances, weight = on_the_ground(fit)
     drive_std = np.sqrt(place_variance(fit))
-    forecast = Forecast(plane(places), np.abs(errors), drive_std, weight, distances)
+    forecast = Forecast(plane(places), np.abs(errors), drive_std, weight, distances, nearest)
     spread_m2 = max(float(plane(places).var(0).sum()), 1e-12)
     explained = 1.0 - float(weight @ np.abs(errors) ** 2) / spread_m2
     return HeldOut(errors, variances, forecast, explained)
@@ -142,13 +142,14 @@ def evidence(basis: Basis, now: MapFit) -> float:
     )
 
 
-def on_the_ground(fit: MapFit) -> tuple[Array, Array]:
-    """Distances (K,) m of the covered ground to the nearest image, and the weights (M,) by which
-    held-out images represent it."""
+def on_the_ground(fit: MapFit) -> tuple[Array, Array, Array]:
+    """Distances (M,) m of held-out images to the nearest of the others, those (K,) m of the covered
+    ground to the nearest image, and the weights (M,) by which held-out images represent it."""
     places = plane(fit.places)
     seed = fit.problem.seed
     distances = ground_distances(places, np.random.default_rng(seed))
-    return distances, importance(nearest_used(places, folds(fit.stack, seed)), distances)
+    nearest = nearest_used(places, folds(fit.stack, seed))
+    return nearest, distances, importance(nearest, distances)
 
 
 def held_out_error(basis: Basis, now: MapFit, weight: Array) -> float:
@@ -203,7 +204,7 @@ def choose(problem: MetricProblem, scale: Array | None = None) -> MapFit:
     if problem.graph is None:
         length, noise = _searched(lambda *pair: evidence(make(*pair), now))
     else:
-        weight = on_the_ground(now)[1]
+        weight = on_the_ground(now)[2]
         length, noise = _searched(lambda *pair: held_out_error(make(*pair), now, weight))
     basis = Process.fit(problem.features, scale / length, noise, INDUCING_POINTS)
     return problem.fit(basis, now)

@@ -31,11 +31,15 @@ import numpy as np
 from scipy import special
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity
+from sfa_localization.data.rig import (
+    CAMERA_STD_M,
+    CONTRADICTS,
+    GIVEN_STD_M,
+    UNKNOWN_YAW_STD,
+    Quantity,
+)
 from sfa_localization.keyframes.turning import UNSURE
 
-GIVEN_STD_M = 0.005
-"""Of a lever arm that was measured on the robot."""
 SLIP_STD_M = 0.1
 """From base_link to the point about which the wheels turn the robot: a third of the track of a
 small robot that slips on one side."""
@@ -45,8 +49,6 @@ and 4 cm in two gardens)."""
 CAMERA_TURN_STD = 1.0
 """rad, of the yaw of a camera in a later drive, which may be mounted anew."""
 
-CONTRADICTS = 4.0
-"""Standard deviations: two measurements of a place never differ by so many by chance."""
 MOUNTED_ANEW_RAD = 0.05
 """A camera that was turned by more between two drives was mounted anew, and its yaw on the robot
 now is not known. A drive of 100 m shows it to 0.01."""

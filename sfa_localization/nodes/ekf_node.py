@@ -20,6 +20,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Empty, SetBool, Trigger
 
 from sfa_localization.data.errors import MessageError
+from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.files import require_outputs
 from sfa_localization.data.geometry import Array, compose, invert
 from sfa_localization.data.settings import Settings
@@ -325,6 +326,7 @@ class EkfNode(LocalizationNode):
 
     def status(self) -> Status:
         """The filter's status, with the reasons that the wall clock gives, as silent inputs."""
+        self.filter.waited_s = self._waited_s()
         status = self.filter.status
         reasons = []
         by_now = self._by_now()
@@ -347,9 +349,10 @@ class EkfNode(LocalizationNode):
         lost = []
         behind_s = self._behind_s()
         if behind_s > timeout_s:
-            reasons.append(f'behind by {behind_s:.1f} s: this computer is too busy')
-            self.get_logger().warning(reasons[-1], throttle_duration_sec=_LOG_S)
-        elif by_now is not None and (reasons or status.level is Level.DEGRADED):
+            busy = f'behind by {behind_s:.1f} s: this computer is too busy'
+            self.get_logger().warning(busy, throttle_duration_sec=_LOG_S)
+            return status.with_reasons([], reasons).because(busy)
+        if by_now is not None and (reasons or status.level is Level.DEGRADED):
             # The filter knows the stamps of messages only; by the wall clock it may be lost.
             lost = [f'{reason} by now' for reason in uncertainty(by_now, self.filter.config)]
         return status.with_reasons(lost, reasons)
@@ -358,6 +361,11 @@ class EkfNode(LocalizationNode):
         """How long the last odometry waited for this node, s."""
         odometry = self.monitors[_ODOM]
         return odometry.waited_s if odometry.silent_for_s() < self._config.silence_timeout else 0.0
+
+    def _waited_s(self) -> float:
+        """How long messages have recently waited for this node, s; 0 where it hardly matters."""
+        waits = [self.monitors[topic].longest_wait_s() for topic in (_ODOM, _IMAGE_POSE)]
+        return max(waits) if max(waits) * 1e9 > DELAY_LIMIT_NS else 0.0
 
     def _by_now(self) -> State | None:
         """The estimate, predicted to the present by the wall clock after a long silence."""

@@ -13,6 +13,8 @@ import numpy as np
 from sfa_localization.data.rejections import RejectionCounter
 
 _WINDOW = 500
+RECENT_S = 10.0
+"""The images by which the filter judges clocks are about as old."""
 
 
 def steady_s() -> float:
@@ -32,17 +34,25 @@ class Monitor:
         self.refused = RejectionCounter()
         self._arrivals_s: deque[float] = deque(maxlen=_WINDOW)
         self._latencies_s: deque[float] = deque(maxlen=_WINDOW)
+        self._waits_s: deque[float] = deque(maxlen=_WINDOW)
 
     def receive(self, received_ns: int = 0) -> None:
         """Count a message; `received_ns` is when the middleware received it, 0 if unknown."""
         self.received += 1
         self.waited_s = max(time.time_ns() - received_ns, 0) * 1e-9 if received_ns > 0 else 0.0
         self._arrivals_s.append(steady_s())
+        self._waits_s.append(self.waited_s)
 
     def use(self) -> None:
         """Count the last message as used, and note the time since it arrived."""
         self.used += 1
         self._latencies_s.append(steady_s() - self._arrivals_s[-1])
+
+    def longest_wait_s(self) -> float:
+        """How long messages that arrived in the last RECENT_S have waited at most, s."""
+        since_s = steady_s() - RECENT_S
+        waits = zip(list(self._arrivals_s), list(self._waits_s), strict=False)
+        return max((wait_s for at_s, wait_s in waits if at_s >= since_s), default=0.0)
 
     def silent_for_s(self) -> float:
         """Seconds since the last arrival; infinite before the first."""

@@ -60,6 +60,9 @@ class SfaNodeConfig(Settings):
 
     model: str = setting('', 'file of the trained model', live=True)
     map_frame: str = setting('map', 'frame of the poses')
+    base_frame: str = setting(
+        'base_link', "the robot's frame, from which /tf_static is compared with the camera's place"
+    )
     image_transport: str = setting(
         'raw', 'listen to panorama, or to panorama/compressed and so on', choices=_TRANSPORTS
     )

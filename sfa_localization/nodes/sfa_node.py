@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, QuaternionStamped
 from nav_msgs.msg import OccupancyGrid
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -27,6 +28,7 @@ from sfa_localization.camera.watch import EXPLAINED_WARNING
 from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
+from sfa_localization.data.static_frames import TOPIC, StaticFrames
 from sfa_localization.fusion.camera_clock import NEAR_NS
 from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.nodes import conversions as convert
@@ -43,6 +45,11 @@ from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import SfaNodeConfig
 from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # the pip wheels of ROS have none
+    TFMessage = None
 
 _FEATURE_FRAME = 'slow_feature_space'
 _TURNED_FRAME = 'first_image'
@@ -74,6 +81,10 @@ class SfaNode(LocalizationNode):
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
         self._declared: PanoramaConfig | None = None
+        self._frames = StaticFrames()
+        self._camera_frame = ''
+        if TFMessage is not None:
+            self.subscribe(TFMessage, TOPIC, self._frames.add, _static_qos())
         self._info = self.following('panorama/info')
         self.subscribe(String, self._info, self._receive_info, latched)
         transport = self._config.image_transport if self.takes_panoramas else 'raw'
@@ -154,8 +165,15 @@ class SfaNode(LocalizationNode):
                 self._topic, lambda panorama: self._locate(*panorama), (stamp_ns, image, frame)
             )
 
-    def _locate(self, stamp_ns: int, image: Image, _: str) -> None:
+    def _camera_problem(self) -> str:
+        """Where /tf_static has the camera otherwise than the model; '' where it has not."""
         assert self._observer is not None
+        lever = self._frames.lever(self._camera_frame, self._config.base_frame)
+        return '' if lever is None else self._observer.model.rig.displaced(lever)
+
+    def _locate(self, stamp_ns: int, image: Image, frame: str) -> None:
+        assert self._observer is not None
+        self._camera_frame = frame
         model = self._observer.model
         if problem := self._declared_problem(model.panorama):
             raise MessageError(problem)
@@ -205,9 +223,17 @@ class SfaNode(LocalizationNode):
             return ERROR, 'no image has been usable', values
         if self._last is not None and self._last.problem:
             return WARN if self._observer.watch.repeats else ERROR, self._last.problem, values
+        if problem := self._camera_problem():
+            self.get_logger().warning(problem, once=True)
+            return WARN, problem, values
         if explained < EXPLAINED_WARNING:
             return WARN, 'images are unlike those of training', values
         return OK, 'locating', values
+
+
+def _static_qos() -> QoSProfile:
+    """As tf2 listens: each driver publishes once, and keeps its transforms for those who join."""
+    return QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 @lru_cache(maxsize=1)

@@ -86,7 +86,7 @@ def errors_of(truth: Trajectory, estimate: Trajectory) -> Errors:
 def tables(scores: Scores) -> str:
     """Position and heading errors as Markdown tables."""
     both = _position_rows(scores), _heading_rows(scores)
-    return '\n\n'.join(_markdown(head, rows) for head, rows in both if rows)
+    return '\n\n'.join(markdown(head, rows) for head, rows in both if rows)
 
 
 def _position_rows(scores: Scores) -> tuple[list[str], list[list[str]]]:
@@ -111,7 +111,7 @@ def _label(name: str) -> str:
     return LABELS.get(name, name)
 
 
-def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table with padded columns, readable as plain text."""
     first = max(len(row[0]) for row in (head, *rows))
     width = max(len(cell) for row in (head, *rows) for cell in row[1:])

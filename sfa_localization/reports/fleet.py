@@ -14,7 +14,8 @@ from sfa_localization.reports import page
 
 STATES = {page.BAD: 'refused', page.WEAK: 'weak', page.GOOD: 'good'}
 """State of a garden by the worst grade of its judgments; the worst is first."""
-_COLUMNS = ('garden', 'state', 'why', 'expected error of an image (m)', 'area (m2)',
+_COLUMNS = ('garden', 'state', 'why', 'tested error of the filter: mean (m)', '95 % below (m)',
+            'expected error of an image (m)', 'area (m2)',
             'age of the training (days)', 'change of the error (m)', 'pages')  # fmt: skip
 _SCRIPT = """
 <style>body { max-width: none; } th { cursor: pointer; } td { vertical-align: top; }
@@ -53,9 +54,12 @@ def write_fleet_page(
     )
 
 
-def _order(result: Mapping[str, Any]) -> tuple[int, float]:
-    """The place of a garden on the page: the worst state first, then the largest error."""
-    return [*STATES].index(result['grade']), -result.get('expected_error_m', 0.0)
+def _order(result: Mapping[str, Any]) -> tuple[int, float, float]:
+    """The place of a garden on the page: the worst state first, then the largest tested error, and
+    where nothing was tested, the largest expected one.
+    """
+    tested = result.get('tested', {}).get('mean_m', -1.0)
+    return [*STATES].index(result['grade']), -tested, -result.get('expected_error_m', 0.0)
 
 
 def _row(folder: Path, result: Mapping[str, Any], now_s: float) -> str:
@@ -63,17 +67,20 @@ def _row(folder: Path, result: Mapping[str, Any], now_s: float) -> str:
     name = result['garden']
     trained_s = result.get('trained_s')
     pages = sorted(file.parent.name for file in (folder / name).glob(f'*/{page.PAGE}'))
-    numbers = {
-        '.2f': result.get('expected_error_m'),
-        '.0f': result.get('area_m2'),
-        '.1f': trained_s and (now_s - trained_s) / 86400,
-        '+.2f': result.get('change_m'),
-    }
+    tested = result.get('tested', {})
+    numbers = [
+        ('.2f', tested.get('mean_m')),
+        ('.2f', tested.get('p95_m')),
+        ('.2f', result.get('expected_error_m')),
+        ('.0f', result.get('area_m2')),
+        ('.1f', trained_s and (now_s - trained_s) / 86400),
+        ('+.2f', result.get('change_m')),
+    ]
     cells = [
         escape(name),
         result['state'],
         '<br>'.join(map(escape, result['sentences'])),
-        *('-' if value is None else format(value, form) for form, value in numbers.items()),
+        *('-' if value is None else format(value, form) for form, value in numbers),
         ' '.join(f'<a href="{quote(f"{name}/{at}/{page.PAGE}")}">{escape(at)}</a>' for at in pages),
     ]
     columns = ''.join(f'<td>{cell}</td>' for cell in cells)

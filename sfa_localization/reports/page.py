@@ -1,13 +1,17 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A self-contained HTML page: figures are part of the file, and there are no scripts."""
+"""A self-contained HTML page, also for phones and dark screens: figures are part of the file, and
+there are no scripts."""
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
 from html import escape
+from io import BytesIO
 from pathlib import Path
+
+from PIL import Image
 
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.reports.figures import save_text
@@ -17,26 +21,45 @@ from sfa_localization.reports.summary import WEAK as WEAK
 
 PAGE = 'index.html'
 MARK = '<meta name="generator" content="sfa_localization">'
+NOTICED = 'What was noticed?'
+"""The heading above the warnings that a command has printed."""
 _STYLE = """
-:root { color-scheme: light; }
+:root { color-scheme: light dark; --text: #222; --back: #fff; --line: #ddd; --dim: #555;
+  --good: #e6f4ea; --weak: #fef7e0; --bad: #fce8e6; }
+@media (prefers-color-scheme: dark) {
+  :root { --text: #ddd; --back: #181a1b; --line: #444; --dim: #aaa;
+    --good: #173a24; --weak: #453512; --bad: #4a1c19; }
+  a { color: #8ab4f8; }
+  figure img { filter: brightness(0.85); }
+}
 * { box-sizing: border-box; }
-body { font: 1rem/1.5 system-ui, sans-serif; color: #222; background: #fff; margin: 0 auto;
-  max-width: 56rem; padding: 1rem; overflow-wrap: break-word; }
+body { font: 1rem/1.5 system-ui, sans-serif; color: var(--text); background: var(--back);
+  margin: 0 auto; max-width: 56rem; padding: 1rem; overflow-wrap: break-word; }
 h1 { font-size: 1.5rem; line-height: 1.2; margin: 0.5rem 0; }
-h2 { font-size: 1.15rem; margin: 2rem 0 0.5rem; border-bottom: 1px solid #ddd; }
+h2 { font-size: 1.15rem; margin: 2rem 0 0.5rem; border-bottom: 1px solid var(--line); }
 p, ul { margin: 0.5rem 0; }
+ul { padding-left: 1.2rem; }
 .verdict { padding: 0.6rem 0.9rem; border-left: 0.5rem solid; border-radius: 0.25rem; }
-.good { background: #e6f4ea; border-color: #1e8e3e; }
-.weak { background: #fef7e0; border-color: #e37400; }
-.bad { background: #fce8e6; border-color: #d93025; }
+.good { background: var(--good); border-color: #1e8e3e; }
+.weak { background: var(--weak); border-color: #e37400; }
+.bad { background: var(--bad); border-color: #d93025; }
 figure { margin: 1rem 0; }
 figure img { display: block; max-width: 100%; height: auto; margin: 0 auto; }
-figcaption { font-size: 0.9rem; color: #555; text-align: center; }
+figcaption { font-size: 0.9rem; color: var(--dim); text-align: center; }
 .wide { overflow-x: auto; margin: 0.75rem 0; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.2rem 0.7rem; border-bottom: 1px solid #ddd; text-align: right; }
+th, td { padding: 0.2rem 0.7rem; border-bottom: 1px solid var(--line); text-align: right; }
 th:first-child, td:first-child { text-align: left; }
+@media (max-width: 40rem) {
+  body { padding: 0.6rem; }
+  th, td { padding: 0.2rem 0.4rem; }
+  .broad img { max-width: none; height: 22rem; width: auto; }
+}
 """
+BROAD = 1.5
+"""Times as wide as high, from which a figure scrolls sideways on a phone: else it is too small."""
+QUALITY = 80
+"""Of the figures in a page: as sharp as the files beside it, in a tenth of their size."""
 
 
 def verdict(level: str, text: str) -> str:
@@ -59,14 +82,23 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def figure(path: Path, caption: str) -> str:
-    """A PNG file, as a part of the page. Raises LocalizationError."""
+    """A PNG file, as a part of the page; a broad one scrolls sideways where the screen is narrow.
+
+    Raises LocalizationError.
+    """
+    compressed = BytesIO()
     try:
-        data = base64.b64encode(path.read_bytes()).decode()
+        with Image.open(path) as picture:
+            width, height = picture.size
+            picture.convert('RGB').save(compressed, 'WEBP', quality=QUALITY)
     except OSError as error:
-        raise LocalizationError(f'{path}: cannot be read: {error.strerror}') from None
+        raise LocalizationError(f'{path}: cannot be read: {error.strerror or error}') from None
+    data = base64.b64encode(compressed.getvalue()).decode()
     words = escape(caption)
+    shape = ' broad' if width > BROAD * height else ''
     return (
-        f'<figure><img src="data:image/png;base64,{data}" alt="{words}">'
+        f'<figure><div class="wide{shape}"><img width="{width}" height="{height}" '
+        f'src="data:image/webp;base64,{data}" alt="{words}"></div>'
         f'<figcaption>{words}</figcaption></figure>'
     )
 

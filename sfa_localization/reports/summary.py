@@ -29,28 +29,42 @@ images are almost useless."""
 
 def summary(trained: Trained) -> str:
     """Amount of data, certificate, expected errors, and skipped data, without ground truth."""
-    lines = [*_map_lines(trained.model.quality), *_drive_lines(trained)]
+    grade, verdict = judgment(trained)
+    quality = trained.model.quality
+    lines = [*_map_lines(quality), *_drive_lines(trained)]
+    if has_forecast(grade, quality):
+        lines[2:2] = _forecast_lines(quality)
     used = {f'{run.name}: {name}': n for run in trained.runs for name, n in run.counts.items()}
     used['metric learning: images'] = trained.segments.images
     used['metric learning: odometry'] = trained.segments.odometry
     for name, count in used.items():
         lines += [f'{name}: {n} skipped: {why}' for why, n in sorted(count.skipped.items())]
-    grade, verdict = judgment(trained)
     return '\n'.join(lines if grade == GOOD else [verdict, *lines])
 
 
+def has_forecast(grade: str, quality: Mapping[str, Any]) -> bool:
+    """Whether errors can be forecast: only for a map of the right shape, of images that show it."""
+    return grade != BAD or bool(quality['expected_error_m'] > USEFUL_M)
+
+
 def _map_lines(quality: Mapping[str, Any]) -> list[str]:
-    """Amount of data, certificate, and expected errors of one image."""
+    """Amount of data, and certificate."""
     coverage = quality['coverage']
-    worst = quality['worst']
     along, across = coverage['extent_m']
     proof = 'proven optimal' if quality['certified'] else 'NOT proven optimal'
     turned = ', then turned maps' if quality['turned'] else ''
-    lines = [
+    return [
         f'images: {quality["pictures"]} in {quality["segments"]} segments of odometry, '
         f'{coverage["length_m"]:.0f} m driven, about {along:.0f} m x {across:.0f} m covered',
         f'map: {quality["features_used"]} slow features{turned}, directions {proof} '
         f'(certificate {quality["certificate"]:.1e})',
+    ]
+
+
+def _forecast_lines(quality: Mapping[str, Any]) -> list[str]:
+    """Expected errors of one image."""
+    worst = quality['worst']
+    lines = [
         f'position: expect {quality["expected_error_m"]:.2f} m mean error of one image on paths '
         f'between the trained ones; worst near x {worst["x_m"]:.1f} m, y {worst["y_m"]:.1f} m: '
         f'{worst["expected_error_m"]:.2f} m',
@@ -90,7 +104,10 @@ def judgment(trained: Trained) -> tuple[str, str]:
     if quality['explained'] < EXPLAINED and not route:
         return BAD, 'The map cannot be used: the images hardly show where they were taken.'
     if expected > USEFUL_M:
-        return BAD, 'The map cannot be used yet: see what to drive next.'
+        return BAD, (
+            f'The map cannot be used yet: expect an error of {expected:.2f} m from one image; see '
+            'what to drive next.'
+        )
     care = too_sparse(trained.metric.poses, InspectionConfig().max_spacing)
     if quality.get('expected_yaw_error_deg', 0.0) > GOOD_DEG:
         care.append('images look alike at several headings, and perhaps at several places')

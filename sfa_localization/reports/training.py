@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from sfa_localization.reports import figures, page
 from sfa_localization.reports.bag import motion_section
 from sfa_localization.reports.evaluation import firing_maps_figure
 from sfa_localization.reports.figures import WorstImage
-from sfa_localization.reports.summary import judgment, summary
+from sfa_localization.reports.summary import has_forecast, judgment, summary
 from sfa_localization.training import Trained
 
 FEW_CROSSINGS = 5
@@ -27,6 +27,8 @@ FEW_CROSSINGS = 5
 PARALLEL = 0.3
 """Spread of driving directions (0 parallel, 1 even) below which the drive was one-sided."""
 _WEAK = 1.5  # times the expected error, from which a place counts as weak
+SHOWN = 95
+"""Percentile of the expected errors up to which colors differ: a few corners would use up all."""
 _CAPTIONS = {
     'coverage': 'Where images were taken (black), on the expected error of one image',
     'line_fits': 'Each segment by odometry (wide) and by slow features (thin)',
@@ -55,12 +57,39 @@ def write_training_report(
     trained: Trained,
     samples: Mapping[WorstImage, Image] | None = None,
     lens: bytes = b'',
+    warnings: Sequence[str] = (),
 ) -> None:
     """Write figures of the training, with `samples` of the worst images and a picture (PNG) of the
-    lens, and index.html.
+    lens, and index.html, which repeats the warnings of the training.
 
     Raises LocalizationError if a file cannot be written.
     """
+    places = trained.metric.poses[:, :2]
+    parts = _figures(folder, trained, samples, lens)
+    grade, sentence = judgment(trained)
+    told = summary(trained).splitlines()
+    page.write_page(
+        folder,
+        f'Training on {", ".join(run.name for run in trained.runs)}',
+        page.verdict(grade, sentence),
+        page.section('Is my map good?', page.items([line for line in told if line != sentence]),
+                     parts['line_fits']),
+        page.section(page.NOTICED, page.items([text for text in warnings if text not in told])),
+        page.section('Where is it weak?', page.items(weak_lines(trained)), parts['coverage'])
+        if has_forecast(grade, trained.model.quality) else '',
+        page.section('May I trust it?', page.items(trust_lines(trained))),
+        page.section('What do I drive next?', page.items(advice(trained, places))),
+        *(motion_section(check.as_dict()) for check in trained.checks),
+        page.section('The camera', parts.get('lens', '')),
+        page.section('Slow features', parts['firing_maps']),
+        page.section('Worst images', parts.get('worst_images', '')),
+    )  # fmt: skip
+
+
+def _figures(
+    folder: Path, trained: Trained, samples: Mapping[WorstImage, Image] | None, lens: bytes
+) -> dict[str, str]:
+    """Write the figures; parts of the page by their names in _CAPTIONS."""
     images = trained.metric.images
     places = trained.metric.poses[:, :2]
     coverage_figure(folder / 'coverage.png', trained, places)
@@ -72,21 +101,7 @@ def write_training_report(
         write_bytes(folder / 'lens.png', lens)
     drawn = {'lens': bool(lens), 'worst_images': bool(samples)}
     names = [name for name in _CAPTIONS if drawn.get(name, True)]
-    parts = {name: page.figure(folder / f'{name}.png', _CAPTIONS[name]) for name in names}
-    page.write_page(
-        folder,
-        f'Training on {", ".join(run.name for run in trained.runs)}',
-        page.verdict(*judgment(trained)),
-        page.section('Is my map good?', page.items(summary(trained).splitlines()),
-                     parts['line_fits']),
-        page.section('Where is it weak?', page.items(weak_lines(trained)), parts['coverage']),
-        page.section('May I trust it?', page.items(trust_lines(trained))),
-        page.section('What do I drive next?', page.items(advice(trained, places))),
-        *(motion_section(check.as_dict()) for check in trained.checks),
-        page.section('The camera', parts.get('lens', '')),
-        page.section('Slow features', parts['firing_maps']),
-        page.section('Worst images', parts.get('worst_images', '')),
-    )  # fmt: skip
+    return {name: page.figure(folder / f'{name}.png', _CAPTIONS[name]) for name in names}
 
 
 def weak_places(forecast: Forecast) -> list[WorstImage]:
@@ -149,10 +164,12 @@ def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
     figure = Figure(figsize=(7.0, 6.0), layout='constrained')
     axes = figure.subplots()
     expected = trained.metric.forecast
-    dots = axes.scatter(
-        expected.places[:, 0], expected.places[:, 1], c=expected.local, s=30, cmap='viridis'
-    )
-    figure.colorbar(dots, ax=axes, label='expected position error of one image (m)')
+    local = expected.local
+    x, y = expected.places.T
+    top = float(np.percentile(local, SHOWN))
+    dots = axes.scatter(x, y, c=local, s=30, cmap='viridis', vmin=0.0, vmax=top)
+    label = 'expected position error of one image (m)'
+    figure.colorbar(dots, ax=axes, label=label, extend='max')
     axes.scatter(places[:, 0], places[:, 1], s=2, color='black')
     x, y, error = expected.worst
     axes.plot(x, y, 'x', color='red', markersize=10, label=f'worst: {error:.2f} m')

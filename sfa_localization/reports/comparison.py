@@ -1,0 +1,45 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Two evaluations side by side: before and after an update, or two models on one drive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sfa_localization.reports import page
+from sfa_localization.reports.evaluation import LABELS, markdown, number
+
+Results = Mapping[str, Any]
+"""What `evaluate --json` writes."""
+MEASURES = ('mean', 'p95', 'max')
+COLUMNS = tuple(f'{name}{which}' for name in MEASURES for which in ('', ', second'))
+HEAD = ('position error (m)', *COLUMNS)
+
+
+def comparison_rows(first: Results, second: Results) -> list[list[str]]:
+    """Cells of a table with the columns HEAD: a row for each estimate that both have."""
+    names = [name for name in LABELS if name in first and name in second]
+    both = [(name, first[name], second[name]) for name in names]
+    return [
+        [LABELS[name], *(number(row[m], m) for m in MEASURES for row in (one, other))]
+        for name, one, other in both
+    ]
+
+
+def comparison_text(first: Results, second: Results) -> str:
+    """The table for a terminal, and both sentences."""
+    sentences = [f'first: {first["sentence"]}', f'second: {second["sentence"]}']
+    return '\n'.join([markdown(HEAD, comparison_rows(first, second)), '', *sentences])
+
+
+def write_comparison_page(folder: Path, names: Sequence[str], results: Sequence[Results]) -> None:
+    """Write `folder`/index.html about two results, by their names. Raises LocalizationError."""
+    verdicts = [
+        page.verdict(result['grade'], f'{name}: {result["sentence"]}')
+        for name, result in zip(names, results, strict=True)
+    ]
+    table = page.table(HEAD, comparison_rows(*results))
+    title = f'{names[0]}, and second {names[1]}'
+    page.write_page(folder, title, *verdicts, page.section('How far off?', table))
