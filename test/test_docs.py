@@ -27,8 +27,9 @@ from study.__main__ import study_parser
 
 from sfa_localization import __version__, cli
 from sfa_localization.bags.reader import Bag
+from sfa_localization.config import SECTIONS
 from sfa_localization.data.settings import Settings
-from sfa_localization.nodes.process import CANNOT_START, DIED
+from sfa_localization.nodes.process import CANNOT_START, DIED, EXECUTABLES
 from sfa_localization.nodes.settings import EkfNodeConfig
 
 PAGES = {
@@ -61,7 +62,13 @@ FOREIGN = {
     'pip',
     'sudo',
 }
-FOREIGN_ROS = {'run robot_localization', 'launch nav2_bringup', 'bag record', 'topic echo', 'service call'}
+FOREIGN_ROS = {
+    'run robot_localization',
+    'launch nav2_bringup',
+    'bag record',
+    'topic echo',
+    'service call',
+}
 
 
 def test_every_command_exists():
@@ -303,8 +310,12 @@ class Recorded:
 
 @pytest.fixture
 def launch_file(monkeypatch):
-    """Return the names of the launch file, with launch replaced by stand-ins."""
-    path = ROOT / 'config/localization.launch.py'
+    return names_of_launch_file('localization.launch.py', monkeypatch)
+
+
+def names_of_launch_file(name, monkeypatch):
+    """Return the names of a launch file, with launch replaced by stand-ins."""
+    path = ROOT / 'config' / name
     imports = re.findall(r'^from (launch[\w.]*) import (.+)$', path.read_text('utf-8'), re.M)
     for module, names in imports:
         classes = dict.fromkeys(names.split(', '), Recorded)
@@ -337,6 +348,26 @@ def launch(launch_file):
         }
 
     return start
+
+
+@pytest.mark.parametrize('localize', ['true', 'false'])
+def test_teaching_starts_the_chain_that_waits_for_its_model(monkeypatch, localize):
+    file = names_of_launch_file('teach.launch.py', monkeypatch)
+    (actions,) = file['generate_launch_description']().given
+    *declared, nodes = actions
+    values = {action.given[0]: action.named.get('default_value') for action in declared}
+    values |= {'output': 'garden.npz', 'localize': localize, 'odom': '/wheels'}
+    context = types.SimpleNamespace(launch_configurations=values)
+    teach, *chain = nodes.named['function'](context, *nodes.named['args'])
+    assert teach.named['executable'] in EXECUTABLES
+    _, parameters = teach.named['parameters']
+    settings = {field.name for kind in SECTIONS['teach_node'] for field in dataclasses.fields(kind)}
+    assert {*parameters} <= settings | {'use_sim_time'} and parameters['odometry'] == '/wheels'
+    assert len(chain) == parameters['localize'] == (localize == 'true')
+    for included in chain:
+        arguments = dict(included.named['launch_arguments'])
+        assert arguments['model'] == 'garden.npz' and arguments['autostart'] == 'false'
+        assert arguments['odom'] == '/wheels' and arguments['image'] == 'image_raw'
 
 
 def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
