@@ -21,7 +21,6 @@ from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import CameraError, DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.run import (
-    Odometry,
     PanoramaArray,
     Points,
     Run,
@@ -45,7 +44,7 @@ from sfa_localization.training_input import Recipe, compared
 
 
 def rows(odometry, chosen):
-    return Odometry(*(getattr(odometry, name)[chosen] for name in Odometry.__slots__))
+    return type(odometry)(*(getattr(odometry, name)[chosen] for name in odometry.__slots__))
 
 
 def showing(run, change):
@@ -407,6 +406,7 @@ TRUTHS = {
     'early': (lambda t: marked(t, -0.15), 'is stamped 0.15 s early'),
     'another clock': (lambda t: marked(t, 37.0), 'is stamped 37.00 s late'),
     'marker': (lambda t: marked(t, lever=-0.4 + 0.2j), 'lies 0.40 m behind and 0.20 m to the left'),
+    'rare': (lambda t: marked(rows(t, np.s_[::8]), lever=0.4j), 'and 0.40 m to the left of'),
     'mirrored': (lambda t: marked(t, 0.2, 0.3j, True), 'is mirrored (y to the right, or x and y'),
     'millimeters': (lambda t: marked(t, unit=1000.0), 'is in millimeters'),
     'centimeters': (lambda t: marked(t, 0.1, unit=100.0), 'is in centimeters'),
@@ -448,7 +448,8 @@ def test_a_short_drive_has_the_offset_of_the_truth_of_other_drives_if_it_fits():
     """Too short to show it alone."""
     track, truth = with_truth(lines=2)
     late = marked(truth, 0.05)
-    alone, known = true_poses(late, track), true_poses(late, track, usual=(0.0, 0.0, 0.05))
+    alone = true_poses(late, track)
+    known = true_poses(late, track, usual=(0.0, 0.0, 0.05))
     assert not alone.sentences and 'is stamped 0.05 s late' in known.sentences[0]
     assert known.offset == pytest.approx((0.0, 0.0, 0.05))
     assert true_poses(truth, track, usual=(0.0, 0.0, 0.05)) == TruePoses(truth)

@@ -145,6 +145,7 @@ def remembered(fixes: tuple[PositionFix, ...], newest: PositionFix) -> tuple[Pos
     near = [fix for fix in fixes if newest.traveled_m - fix.traveled_m <= reach_m]
     latest = (*near, newest)[-LATEST:]
     older = near[: len(near) + 1 - len(latest)]
+    # test_of_what_is_remembered_the_newer_half_is_complete_and_the_older_reaches_far
     if len(older) + len(latest) > CAPACITY:
         older = [fix for fix in older if fix.is_new][LATEST - CAPACITY :]
     return (*older, *latest)

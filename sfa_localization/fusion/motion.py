@@ -236,6 +236,7 @@ def _by_errors(mean: Array, twist: Twist) -> Array:
     """Derivatives (2, 5) of speed and turn rate by BIAS to OFFSET, in which they are linear."""
     by_loss = offset = 0.0
     # A loss slows a robot down, but turns no motion around; what turns on the spot does not drive.
+    # test_a_loss_in_turns_slows_the_robot_and_never_turns_it_around
     if abs(twist.v) > max(SPOT_RADIUS_M, 2 * abs(float(mean[LOSS]))) * abs(twist.omega):
         by_loss = -math.copysign(abs(twist.omega), twist.v)
         offset = 1.0
@@ -303,6 +304,7 @@ def _advance(
     added = np.diag([slip, slip, yaw, 0, 0, *walks, *[1 - fade * fade] * 3])
     # Readings err alike for a while, which does not average out with the rate of the messages: over
     # dt it moves the pose as a constant error of variance (variance * time / dt) would.
+    # test_errors_of_readings_do_not_average_out_with_the_rate_of_messages
     if dt > 0:
         lasting = ODOMETRY_CORRELATION_S / dt * twist.covariance
         added[:3, :3] += by_twist @ lasting @ by_twist.T

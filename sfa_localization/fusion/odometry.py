@@ -118,6 +118,7 @@ def _is_sideways_or_first(belief: Belief, event: OdometryEvent) -> bool:
     changes for the first time after twists were used.
     """
     assert belief.odometry.pose is not None and event.pose is not None
+    # The first change: test_a_pose_that_is_repeated_adds_nothing[fresh-12]
     if not belief.odometry.renewed_ns and (belief.twist.v or belief.twist.omega):
         return True
     seconds = silence_s(belief, event)
@@ -147,6 +148,7 @@ def _remaining(belief: Belief, event: OdometryEvent, mean: Twist) -> Twist:
     """The mean twist since the belief. An image within the interval was fused where the last twist
     led by then; the rest of the interval leads from there to the pose of the odometry.
     """
+    # test_odometry_with_poses_may_be_stamped_irregularly[stalled]
     last = belief.odometry
     coasted_s = (belief.stamp_ns - (last.stamp_ns or belief.stamp_ns)) * 1e-9
     remaining_s = (event.stamp_ns - belief.stamp_ns) * 1e-9

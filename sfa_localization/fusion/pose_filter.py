@@ -226,6 +226,7 @@ class PoseFilter:
             clock = self._camera.clock_at(stamp_ns)
             taken_ns = stamp_ns - clock.delay_ns  # by the clock of the odometry
             around = self._history.before(taken_ns), self._history.before(stamp_ns)
+            # Needed by the fault "all stamped on reception, with stalls".
             if clock.delay_ns and stalled(*around, taken_ns, stamp_ns):
                 taken_ns = stamp_ns  # all messages were late: the order of the stamps says more
             self._require_place(taken_ns, MEASUREMENT)
@@ -331,6 +332,7 @@ class PoseFilter:
 
     def _at(self, stamp_ns: int) -> State | None:
         """If odometry repeats commands, the robot is where it was one delay ago."""
+        # test_the_estimate_is_where_commands_led_a_camera_delay_ago
         robot_ns = stamp_ns
         delay_ns = self._camera.clock.delay_ns if self._open_loop.repeats else 0
         if 0 < abs(delay_ns) <= DELAY_LIMIT_NS and self._history.reaches(stamp_ns - delay_ns):

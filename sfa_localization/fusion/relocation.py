@@ -58,6 +58,7 @@ class Relocation(NamedTuple):
         """Whether agreeing images outweigh the estimate that they contradict."""
         images = self.images
         support = belief.memory.support
+        # Others that dissent: the fault "two far frames in turns".
         if images < AGREEING_PER_OTHER * self.contradicting or images <= self.dissenting:
             return False
         # A new estimate is overruled by one image more than support it.

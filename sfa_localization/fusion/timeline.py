@@ -120,6 +120,7 @@ class Timeline:
         """Raises ClockWentBack for odometry that covers once more, in order, what other odometry
         covered before it; odometry that fills a gap, or is out of order, was only delayed.
         """
+        # Needed by the fault "all clocks step -1.71 s".
         among, first_ns, last_ns = self._again
         if newest_ns is None or stamp_ns > newest_ns:
             self._again = 0, 0, 0

@@ -10,16 +10,15 @@ the images over each step of the odometry is compared with the usual one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, Indices, Mask, relative
+from sfa_localization.data.geometry import Array, Mask, relative
 from sfa_localization.data.odometry_steps import JUMP, beyond, tolerance
 from sfa_localization.data.run import Odometry, Stamps, chained
-from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
+from sfa_localization.data.statistics import quantile
 from sfa_localization.keyframes.closures import LIKE
 from sfa_localization.motion.dead_reckoning import pauses, spaced, summed
 
@@ -40,72 +39,32 @@ STOOD_S = 1.0
 OTHER = 0.05
 """Quantile of the correlations of neighboring images below which an image may show another
 place."""
-# s around a step in which its usual speed is measured.
-_AROUND_S = 0.5
 # Correlations below are those of noise.
 _LEAST_LIKE = 1e-2
 
 
 def _jumps(odometry: Odometry) -> tuple[Mask, Array, float]:
-    """Mask (N - 1,) of impossible steps, the steps (N - 1, 3) interpolated from the motion around
-    them, and the standard deviation, m, of the regular steps from these.
+    """Mask (N - 1,) of impossible steps, the steps (N - 1, 3) interpolated from the speeds around
+    them, and the noise, m or rad, of the regular steps: see data.odometry_steps.
     """
     step = relative(odometry.poses[:-1], odometry.poses[1:])
     dt = np.diff(odometry.stamps_ns) * 1e-9
     period = max(float(np.median(dt)), 1e-3)
-    shortest_s, more_s = _times(dt, period)
-    here = np.arange(len(step))
-    first, last = _around(dt, max(_AROUND_S, 3 * period))
-    single = np.pad(step / np.maximum(dt, period)[:, None], ((1, 1), (0, 0)), 'edge')
-    values = np.column_stack([step, dt])
-    jump = np.zeros(len(step), bool)
-    for _ in range(2):
-        sums = np.vstack([np.zeros(4), np.cumsum(values * ~jump[:, None], axis=0)])
-        before = sums[here] - sums[first]
-        after = sums[last] - sums[here + 1]
-        means = [_speed(each, period) for each in (before, after)]
-        usual = _speed(before + after, period) * dt[:, None]
-        noise = _noise(step - usual)
-        speeds = *means, single[:-2], single[2:]
-        jump = _beyond(step, speeds, shortest_s, more_s) > tolerance(np.maximum(dt, period), noise)
-    return jump, usual, noise
-
-
-def _noise(missed: Array) -> float:
-    """The standard deviation, m, of steps (N, 3) from those expected."""
-    return MEDIAN_TO_STD * float(np.median(np.abs(missed)[:, :2].max(1)))
-
-
-def _times(dt: Array, period: float) -> tuple[Array, Array]:
-    """The shortest times (N,) s of steps that stamps `dt` (N,) s apart show, and how much longer
-    they may have been: messages may be stamped late, or in bundles.
-    """
-    unsure_s = float(np.percentile(np.abs(dt - period), 90))
-    shortest_s = np.maximum(dt - unsure_s, 0.0)
-    return shortest_s, np.maximum(dt, period) + unsure_s - shortest_s
-
-
-def _around(dt: Array, reach_s: float) -> tuple[Indices, Indices]:
-    """The first step (N,) near each step, and the one after the last."""
-    at = summed(dt)[:-1] + dt / 2
-    return np.searchsorted(at, at - reach_s), np.searchsorted(at, at + reach_s, 'right')
-
-
-def _speed(sums: Array, period: float) -> Array:
-    """Mean speeds (N, 3), m/s and rad/s, by sums (N, 4) of steps and of their seconds."""
-    return np.asarray(sums[:, :3] / np.maximum(sums[:, 3:], period))
-
-
-def _beyond(step: Array, speeds: Sequence[Array], shortest_s: Array, more_s: Array) -> Array:
-    """How far, m or rad, steps (N, 3) lie beyond where the nearest of the speeds (N, 3) leads in
-    the shortest time (N,) or up to `more_s` (N,) longer.
-    """
-    rest = [(step - speed * shortest_s[:, None], speed) for speed in speeds]
+    usual_s = np.maximum(dt, period)
+    # Messages may be stamped late, or in bundles.
+    longest_s = usual_s + float(np.percentile(np.abs(dt - period), 90))
+    speed = step / usual_s[:, None]
+    padded = np.pad(speed, ((1, 1), (0, 0)), 'edge')  # before and after
     distances = [
-        np.min([beyond(left[:, axes], more_s, [speed[:, axes]]) for left, speed in rest], axis=0)
+        beyond(step[:, axes], longest_s, [padded[:-2, axes], padded[2:, axes]])
         for axes in (slice(0, 2), slice(2, 3))
     ]
-    return np.asarray(np.max(distances, axis=0))
+    distance = np.max(distances, axis=0)
+    noise = quantile(distance, 0.68)  # as data.odometry_steps learns it
+    jump = distance > tolerance(usual_s, noise)
+    rows = np.arange(len(step))
+    around = [np.interp(rows, rows[~jump], each[~jump]) for each in speed.T]
+    return jump, np.transpose(around) * dt[:, None], noise
 
 
 def parted(odometry: Odometry) -> tuple[Odometry, str]:
