@@ -143,7 +143,8 @@ class Pair:
             parts.append(f'{abs(self.scale):.3g} times as far{unit(self)}')
         if self.late_s:
             parts.append(late(self.late_s))
-        verb = 'turns' if self.what == 'turns' else 'drives'
+        turns = 'turn' if self.b == IMAGES else 'turns'
+        verb = turns if self.what == 'turns' else 'drives'
         return f'{self.b} {verb} {", ".join(parts)}' if parts else 'alike'
 
 
