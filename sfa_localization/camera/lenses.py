@@ -262,14 +262,26 @@ def make_camera(
     """
     if min(size) < 1:
         raise CameraError(f'an image of {size[1]} x {size[0]} pixels is empty')
-    lens = _make_lens(calibration, size, panorama or PanoramaConfig())
     axis = calibration.axis
     if axis == 'auto' or calibration.camera_model in UNCALIBRATED:
         axis = _USUAL_AXIS.get(calibration.camera_model, 'forward')
+    to_robot = rotation(*np.radians(mount_rpy)) @ _AXES[axis]
+    return turned_camera(calibration, size, to_robot, panorama)
+
+
+def turned_camera(
+    calibration: LensCalibration,
+    size: tuple[int, int],
+    to_robot: Array,
+    panorama: PanoramaConfig | None = None,
+) -> CameraModel:
+    """Build the camera whose optical axes (x along columns, y along rows, z into the scene, as of
+    REP 103) `to_robot` (3, 3) turns to the robot's. Raises CameraError as `make_camera`.
+    """
+    lens = _make_lens(calibration, size, panorama or PanoramaConfig())
     reversal = np.diag([-1.0 if calibration.is_mirrored else 1.0, 1.0, 1.0])
-    to_robot = rotation(*np.radians(mount_rpy)) @ _AXES[axis] @ reversal
     radii = (calibration.radius_min, calibration.radius_max)
-    return CameraModel(lens, to_robot, size, _scale(calibration, size), radii)
+    return CameraModel(lens, to_robot @ reversal, size, _scale(calibration, size), radii)
 
 
 def _scale(calibration: LensCalibration, size: tuple[int, int]) -> Array:

@@ -188,7 +188,7 @@ def build_tables(
     wraps = calibration.camera_model in UNCALIBRATED  # its columns close on themselves
     if wraps:  # beyond its upper and lower edge, as leveling does, these are repeated
         pixels = model.lens.project(rays @ model.rotation)
-    hidden = _in_sectors(rays, camera.blind_sectors)
+    hidden = hidden_sectors(rays, camera.blind_sectors)
     if camera.mask_file:
         hidden |= _masked(read_mask(camera.mask_file, size), pixels)
     visible &= ~hidden
@@ -210,7 +210,7 @@ def _masked(mask: Mask, pixels: Array) -> Mask:
     return np.asarray(~mask[nearest[..., 1], nearest[..., 0]])
 
 
-def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
+def hidden_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
     """Mask (H, W) of the rays whose azimuth is in a sector from start to end, degrees.
 
     A sector whose end meets its start, as from -180 to 180, is the whole circle.
