@@ -27,6 +27,7 @@ from rosbags.typesys.store import Typestore
 
 from sfa_localization.bags.decoding import typestore
 from sfa_localization.camera.encodings import encode_jpeg, encode_png
+from sfa_localization.camera.sectors import MountedCamera
 from sfa_localization.camera.settings import LensCalibration
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import Array
@@ -158,17 +159,17 @@ class BagWriter:
         self.message(topic, stamp_ns, message)
 
     def static_transforms(
-        self, stamp_ns: int, parent: str, transforms: Mapping[str, Array]
+        self, stamp_ns: int, parent: str, cameras: Mapping[str, MountedCamera]
     ) -> None:
-        """Write, latched, the transforms (4, 4) from frames to their `parent`, by their names."""
+        """Write, latched, the transforms from the optical frames of cameras to their `parent`."""
         message = blank(self._types, 'tf2_msgs/msg/TFMessage')
-        for frame, matrix in transforms.items():
+        for frame, camera in cameras.items():
             part = self._stamped('geometry_msgs/msg/TransformStamped', stamp_ns, parent)
             part.child_frame_id = frame
             moved = part.transform.translation
             turned = part.transform.rotation
-            moved.x, moved.y, moved.z = matrix[:3, 3].tolist()
-            turned.x, turned.y, turned.z, turned.w = _quaternion(matrix[:3, :3])
+            moved.x, moved.y, moved.z = camera.place
+            turned.x, turned.y, turned.z, turned.w = _quaternion(np.array(camera.rotation))
             message.transforms.append(part)
         self.message('/tf_static', stamp_ns, message, LATCHED)
 

@@ -244,6 +244,8 @@ _AXES = {  # columns: directions of the image's right, bottom and center
     'up': np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
     'forward': np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
 }
+OPTICAL_AXES = _AXES['forward']
+"""The axes of an optical frame (REP 103) on a robot that looks ahead."""
 _BACK = np.diag([-1.0, -1.0, 1.0])  # the axes of a camera that looks back, x forward
 _USUAL_AXIS = {'mirror': 'down', 'polar': 'down', 'fisheye': 'up', 'ocam': 'up'}
 _ASPECT_TOLERANCE = 0.02  # between image and calibration, for rounded sizes

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfa_localization.camera.lenses import CameraModel, make_camera
+from sfa_localization.camera.lenses import OPTICAL_AXES, turned_camera
+from sfa_localization.camera.sectors import MountedCamera
 from sfa_localization.camera.settings import LensCalibration
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.sphere import rotation
 from sfa_localization.simulation.garden import CAMERA_HEIGHT_M
 from sfa_localization.simulation.rendering import View, pixel_view
 from sfa_localization.simulation.settings import SimulationConfig
@@ -22,47 +23,37 @@ NAMES = {2: ('front', 'rear'), 4: ('front', 'left', 'rear', 'right')}
 
 
 @dataclass(frozen=True, slots=True)
-class MountedCamera:
-    """A camera on the robot: its lens, its place ahead + i left, m, and the direction in which it
-    looks. Its images are `exposure` times as bright, and are taken `skew_ns` later than planned.
+class SimulatedCamera:
+    """A camera on the robot. Its images are `exposure` times as bright as others, and are taken
+    `skew_ns` later than planned.
     """
 
-    name: str
-    lens: LensCalibration
-    place: complex
-    yaw_rad: float
+    mounted: MountedCamera
     exposure: float
     skew_ns: int
 
     @property
-    def _model(self) -> CameraModel:
-        """The lens in the robot's axes."""
-        size = self.lens.image_height, self.lens.image_width
-        return make_camera(self.lens, size, mount_rpy=(0.0, 0.0, float(np.degrees(self.yaw_rad))))
-
-    @property
     def view(self) -> View:
         """The kind of its images."""
-        model = self._model
-        plain = pixel_view(model.unproject, model.size, 1.0 / self.lens.fx)
+        lens = self.mounted.lens
+        size = lens.image_height, lens.image_width
+        model = turned_camera(lens, size, np.array(self.mounted.rotation))
+        plain = pixel_view(model.unproject, size, 1.0 / lens.fx)
         exposure = np.float32(self.exposure)
         return View(plain.dome, lambda dome, gain: plain.image(dome, gain * exposure))
 
     @property
-    def frame(self) -> str:
-        """The name of its optical frame (REP 103)."""
-        return f'{self.name}_optical_frame'
+    def place(self) -> complex:
+        """Where it sits, ahead + i left, m."""
+        return complex(*self.mounted.place[:2])
 
     @property
-    def pose(self) -> Array:
-        """The transform (4, 4) from its optical frame to base_link."""
-        transform = np.eye(4)
-        transform[:3, :3] = self._model.rotation
-        transform[:3, 3] = self.place.real, self.place.imag, CAMERA_HEIGHT_M
-        return transform
+    def frame(self) -> str:
+        """The name of its optical frame (REP 103)."""
+        return f'{self.mounted.name}_optical_frame'
 
 
-def cameras_of(config: SimulationConfig) -> list[MountedCamera]:
+def cameras_of(config: SimulationConfig) -> list[SimulatedCamera]:
     """The cameras of a robot, evenly around it, the first looking ahead. Raises ConfigError."""
     count = config.cameras
     if count and config.images == 'panorama':
@@ -73,10 +64,12 @@ def cameras_of(config: SimulationConfig) -> list[MountedCamera]:
     lens = lens_of(config)
     cameras = []
     for number, name in enumerate(names):
-        yaw = 2 * np.pi * number / count
-        place = config.camera_radius * np.exp(1j * yaw)
-        skew_ns = round(1e6 * skews_ms[number])
-        cameras.append(MountedCamera(name, lens, place, yaw, exposures[number], skew_ns))
+        pose = np.eye(4)
+        pose[:3, :3] = rotation(0.0, 0.0, 2 * np.pi * number / count)
+        pose[:3, 3] = pose[:3, :3] @ [config.camera_radius, 0.0, CAMERA_HEIGHT_M]
+        pose[:3, :3] = pose[:3, :3] @ OPTICAL_AXES
+        mounted = MountedCamera.at(name, lens, pose)
+        cameras.append(SimulatedCamera(mounted, exposures[number], round(1e6 * skews_ms[number])))
     return cameras
 
 

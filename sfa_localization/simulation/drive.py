@@ -25,7 +25,7 @@ from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.progress import progress_over
 from sfa_localization.data.run import Image, Odometry, Stamps, Trajectory, YawRate, integrate
-from sfa_localization.simulation.cameras import MountedCamera, cameras_of
+from sfa_localization.simulation.cameras import SimulatedCamera, cameras_of
 from sfa_localization.simulation.garden import Garden, rounded
 from sfa_localization.simulation.rendering import Light, View, panorama_view, raw_view
 from sfa_localization.simulation.routes import ROUTES, Lawn, Motion, Route
@@ -316,12 +316,12 @@ def _of_cameras(
     drive: SimulatedDrive,
     garden: Garden,
     config: SimulationConfig,
-    cameras: Sequence[MountedCamera],
+    cameras: Sequence[SimulatedCamera],
     shown: Callable[[Iterable[Image]], Iterator[Image]],
 ) -> list[Entries]:
     """Transforms, calibrations and images of cameras; `shown` shows the progress of the first."""
     start_ns = int(drive.truth.stamps_ns[0])
-    poses = {camera.frame: camera.pose for camera in cameras}
+    poses = {camera.frame: camera.mounted for camera in cameras}
     transforms = partial(bag.static_transforms, start_ns, 'base_link', poses)
     entries: list[Entries] = [iter([(start_ns, transforms)])]
     for number, camera in enumerate(cameras):
@@ -329,9 +329,9 @@ def _of_cameras(
         stamps_ns = skewed.image_stamps_ns
         frames = render_images(garden, skewed, config, camera.view, camera.place, number)
         frames = frames if number else shown(frames)
-        info = partial(bag.camera_info, lens=camera.lens, frame_id=camera.frame)
-        entries.append(_entries(info, f'/{camera.name}/camera_info', stamps_ns))
-        topic = f'/{camera.name}/image_raw'
+        info = partial(bag.camera_info, lens=camera.mounted.lens, frame_id=camera.frame)
+        entries.append(_entries(info, f'/{camera.mounted.name}/camera_info', stamps_ns))
+        topic = f'/{camera.mounted.name}/image_raw'
         entries.append(_images(bag, topic, camera.frame, stamps_ns, frames, config))
     return entries
 
