@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from sfa_localization.camera.lenses import turned_camera
+from sfa_localization.camera.lenses import OPTICAL_AXES, turned_camera
 from sfa_localization.camera.panorama import (
     hidden_sectors,
     nearest_visible,
@@ -30,6 +30,7 @@ from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.run import Image
+from sfa_localization.data.sphere import rotation
 
 FEATHER_DEG = 10.0
 """Width of a seam between two cameras: four cameras of 100 degrees overlap by so much."""
@@ -73,6 +74,16 @@ class MountedCamera:
         """The azimuth of the optical axis, rad, counterclockwise from forward."""
         x, y, _ = self.ahead
         return float(np.arctan2(y, x))
+
+
+def optical_pose(place: Sequence[float], angles_deg: Sequence[float]) -> Array:
+    """The pose (4, 4) on base_link of the optical frame of a camera at a place, m, by roll, pitch
+    and yaw; with angles of 0 it looks ahead.
+    """
+    pose = np.eye(4)
+    pose[:3, :3] = rotation(*np.radians(angles_deg)) @ OPTICAL_AXES
+    pose[:3, 3] = place
+    return pose
 
 
 class Sector(NamedTuple):

@@ -22,6 +22,8 @@ from sfa_localization.data.run import Image
 
 FEWEST_CAMERAS = 2
 MOST_CAMERAS = 8
+BRIDGED_S = 3.0
+"""Seconds for which the panorama may lack a camera, before that is a reason to doubt the pose."""
 _RATES = 200  # of turns that are kept: those of a second or more
 _NEAR_NS = 200_000_000  # an older rate of turn says nothing about an image
 
@@ -56,6 +58,7 @@ class Surround:
         self._exposures = Exposures(names)
         self._turns = TurnRates()
         self._shown: View | None = None
+        self._stamp_ns = 0
 
     @property
     def panorama(self) -> PanoramaConfig:
@@ -71,6 +74,15 @@ class Surround:
     def visible(self) -> Mask | None:
         """Which pixels (H, W) of the last panorama cameras saw; None before it."""
         return None if self._shown is None else self._shown.visible
+
+    @property
+    def problems(self) -> list[str]:
+        """Which cameras the panorama has lacked for longer than BRIDGED_S, and why."""
+        return [
+            f'camera {name}: {trouble.reason}'
+            for name, trouble in self.troubles.items()
+            if self._stamp_ns > trouble.since_ns + BRIDGED_S * 1e9
+        ]
 
     def check(self) -> None:
         """Raise CameraError for cameras that cannot be used, as far as their lenses tell."""
@@ -89,7 +101,10 @@ class Surround:
         return [(images.stamp_ns, self.compose(images)) for images in joined]
 
     def join(self, name: str, stamp_ns: int, image: Image) -> list[Joined]:
-        """Take an image; return the images of one time that are complete now."""
+        """Take an image; return the images of one time that are complete now. Raises CameraError
+        for an image of another camera.
+        """
+        self._view.sector(name, image.shape[:2])
         return self._joiner.add(name, stamp_ns, image)
 
     def flush(self) -> list[Joined]:
@@ -119,6 +134,7 @@ class Surround:
     def _report(self, reasons: Mapping[str, str], stamp_ns: int) -> None:
         """Keep since when each camera has been in trouble."""
         before = self.troubles
+        self._stamp_ns = stamp_ns
         self.troubles = {
             name: Trouble(reason, before[name].since_ns if name in before else stamp_ns)
             for name, reason in reasons.items()

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfa_localization.camera.lenses import OPTICAL_AXES, turned_camera
-from sfa_localization.camera.sectors import MountedCamera
+from sfa_localization.camera.lenses import turned_camera
+from sfa_localization.camera.sectors import MountedCamera, optical_pose
 from sfa_localization.camera.settings import LensCalibration
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.data.sphere import rotation
+from sfa_localization.data.sphere import directions
 from sfa_localization.simulation.garden import CAMERA_HEIGHT_M
 from sfa_localization.simulation.rendering import View, pixel_view
 from sfa_localization.simulation.settings import SimulationConfig
@@ -64,10 +64,9 @@ def cameras_of(config: SimulationConfig) -> list[SimulatedCamera]:
     lens = lens_of(config)
     cameras = []
     for number, name in enumerate(names):
-        pose = np.eye(4)
-        pose[:3, :3] = rotation(0.0, 0.0, 2 * np.pi * number / count)
-        pose[:3, 3] = pose[:3, :3] @ [config.camera_radius, 0.0, CAMERA_HEIGHT_M]
-        pose[:3, :3] = pose[:3, :3] @ OPTICAL_AXES
+        yaw_deg = 360.0 * number / count
+        x, y, _ = config.camera_radius * directions(np.radians(yaw_deg), 0.0)
+        pose = optical_pose((x, y, CAMERA_HEIGHT_M), (0.0, 0.0, yaw_deg))
         mounted = MountedCamera.at(name, lens, pose)
         cameras.append(SimulatedCamera(mounted, exposures[number], round(1e6 * skews_ms[number])))
     return cameras
