@@ -4,6 +4,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from typing import Any
+
 import numpy as np
 
 from sfa_localization.bags import decoding
@@ -15,34 +18,49 @@ from sfa_localization.data.messages import require_sane
 TOPIC = '/tf_static'
 
 
+class Frames:
+    """Frames of a bag: the frame of each topic in its messages, and the tree of /tf_static."""
+
+    def __init__(self) -> None:
+        self.of_topic = dict[str, str]()
+        self._parents = dict[str, tuple[str, Array]]()
+        self.transforms = 0
+
+    def add(self, topic: str, message: Any) -> None:
+        """Take a message. Raises MessageError for transforms that are none."""
+        if topic == TOPIC:
+            self._parents |= _links(message)
+            self.transforms += 1
+            return
+        frame = getattr(message, 'child_frame_id', message.header.frame_id)
+        self.of_topic[topic] = frame.lstrip('/')
+
+    def pose(self, sensor: str, base: str) -> Array | None:
+        """The pose (4, 4) of one frame in another; None where transforms do not connect them."""
+        sensor_root, from_sensor = _to_root(sensor, self._parents)
+        base_root, from_base = _to_root(base, self._parents)
+        if sensor_root != base_root:
+            return None
+        return np.asarray(np.linalg.solve(from_base, from_sensor))
+
+
 def lever_arm(bag: Bag, sensor_topic: str, odometry_topic: str) -> complex | None:
     """Place of a sensor, ahead + i left, m, from the odometry's child frame; None if unknown."""
     topic = bag.topics.get(TOPIC)
     if topic is None or not decoding.can_decode(topic):
         return None
-    frames = dict[str, str]()
-    parents = dict[str, tuple[str, Array]]()
-    transforms = 0
+    frames = Frames()
     for record, _, data in bag.messages({TOPIC, sensor_topic, odometry_topic}):
-        if record.name in frames and record.name != TOPIC:
+        if record.name in frames.of_topic and record.name != TOPIC:
             continue
-        try:
-            message = decoding.decode(data, record)
-            if record.name == TOPIC:
-                parents |= _links(message)
-                transforms += 1
-            else:
-                frame = getattr(message, 'child_frame_id', message.header.frame_id)
-                frames[record.name] = frame.lstrip('/')
-        except (MessageError, AttributeError):  # a topic without frames
-            continue
-        if len(frames) == 2 and transforms >= topic.count:
+        with contextlib.suppress(MessageError, AttributeError):  # a topic without frames
+            frames.add(record.name, decoding.decode(data, record))
+        if len(frames.of_topic) == 2 and frames.transforms >= topic.count:
             break
-    sensor = _to_root(frames.get(sensor_topic, ''), parents)
-    base = _to_root(frames.get(odometry_topic, ''), parents)
-    if len(frames) < 2 or sensor[0] != base[0]:
+    if len(frames.of_topic) < 2:
         return None
-    return complex(*np.linalg.solve(base[1], sensor[1])[:2, 3])
+    pose = frames.pose(frames.of_topic[sensor_topic], frames.of_topic[odometry_topic])
+    return None if pose is None else complex(*pose[:2, 3])
 
 
 def _links(message: object) -> dict[str, tuple[str, Array]]:

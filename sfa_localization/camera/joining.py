@@ -89,8 +89,8 @@ class StampJoiner:
             else:
                 track.steps.append(stamp_ns - track.last_ns)
         track.last_ns = stamp_ns
-        if self._belongs_to_joined(stamp_ns):
-            track.is_late = name in self._absent
+        if name in self._absent and self._belongs_to_joined(stamp_ns):
+            track.is_late = True
         else:
             track.waiting.append((stamp_ns, image))
         return self._complete()
@@ -106,7 +106,7 @@ class StampJoiner:
         self._joined_ns = None
 
     def _belongs_to_joined(self, stamp_ns: int) -> bool:
-        """Whether an image belongs to images that were joined already, or to earlier ones."""
+        """Whether an image of a camera that was absent is of the last time, or of earlier ones."""
         half = self._tracks[self._lead].period_ns / 2
         return self._joined_ns is not None and stamp_ns <= self._joined_ns + half
 

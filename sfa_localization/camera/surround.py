@@ -6,7 +6,7 @@ panoramas out. The nodes and the reading of bags both use it.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -56,6 +56,7 @@ class Surround:
         self._exposures = Exposures(names)
         self._turns = TurnRates()
         self._shown: View | None = None
+        self._uses: Counter[frozenset[str]] = Counter()
 
     @property
     def panorama(self) -> PanoramaConfig:
@@ -71,6 +72,15 @@ class Surround:
     def visible(self) -> Mask | None:
         """Which pixels (H, W) of the last panorama cameras saw; None before it."""
         return None if self._shown is None else self._shown.visible
+
+    @property
+    def seen(self) -> Mask | None:
+        """Which pixels (H, W) most panoramas showed so far; None if all."""
+        if not self._uses:
+            return None
+        ((most, _),) = self._uses.most_common(1)
+        view = self._view.of(most)
+        return None if view.visible.all() else view.visible
 
     def check(self) -> None:
         """Raise CameraError for cameras that cannot be used, as far as their lenses tell."""
@@ -114,6 +124,7 @@ class Surround:
         parts = self._view.parts(images, shifts)
         self._exposures.add(joined.stamp_ns, parts, view.overlaps)
         self._shown = view
+        self._uses[frozenset(images)] += 1
         return self._view.joined(parts, view, self._exposures.factors)
 
     def _report(self, reasons: Mapping[str, str], stamp_ns: int) -> None:
@@ -145,6 +156,12 @@ def place_of(cameras: Sequence[MountedCamera]) -> complex:
     """The place of their panorama on base_link, ahead + i left, m: the mean of the cameras'."""
     places = np.array([camera.place[:2] for camera in cameras])
     return complex(*places.mean(axis=0))
+
+
+def sentence(cameras: Sequence[MountedCamera]) -> str:
+    """Which cameras make one panorama, and where they look."""
+    looks = [f'{camera.name} {np.degrees(camera.yaw):.0f}' for camera in cameras]
+    return f'{len(cameras)} cameras are one panorama, looking to {", ".join(looks)} degrees of yaw'
 
 
 class TurnRates:
