@@ -126,7 +126,7 @@ def evaluate(
     smoothed after the drive. Unusable images count as skipped observations. Raises BagError or
     DataError, also without ground truth.
     """
-    recipe = as_live(recipe or Recipe(), model.panorama, model.lens)
+    recipe = as_live(recipe or Recipe(), model.panorama, model.lens, model.surround)
     recipe = replace(recipe, origin=model.origin)
     drives = list[_Located]()
     for path in align_bags:

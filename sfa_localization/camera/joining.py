@@ -21,8 +21,8 @@ NO_IMAGE = 'it sends no images'
 LATE = 'its images come after those of the next time'
 _STEPS = 9
 """Intervals of a camera, of which the median is its period: a lost image doubles one."""
-_AWAITED = 3.0
-"""Periods for which a camera without images is waited for: each wait costs a period at most."""
+_AWAITED = 3
+"""Times without an image for which a camera is waited for: each wait costs a period at most."""
 _SILENT = 1.5
 """Periods after which a silent camera no longer leads: one image is lost for certain."""
 
@@ -39,12 +39,15 @@ class Joined(NamedTuple):
 
 @dataclass(slots=True)
 class _Track:
-    """The images of a camera that wait, and the steps of its stamps, ns."""
+    """The images of a camera that wait, the steps of its stamps, ns, and for how many times it has
+    had no image.
+    """
 
     waiting: deque[tuple[int, Image]] = field(default_factory=deque)
     steps: deque[int] = field(default_factory=lambda: deque(maxlen=_STEPS))
     last_ns: int | None = None
     is_late: bool = False
+    missed: int = 0
 
     @property
     def period_ns(self) -> float:
@@ -89,8 +92,9 @@ class StampJoiner:
             else:
                 track.steps.append(stamp_ns - track.last_ns)
         track.last_ns = stamp_ns
-        if self._belongs_to_joined(stamp_ns):
-            track.is_late = name in self._absent
+        track.missed = 0
+        if name in self._absent and self._belongs_to_joined(stamp_ns):
+            track.is_late = True
         else:
             track.waiting.append((stamp_ns, image))
         return self._complete()
@@ -106,7 +110,7 @@ class StampJoiner:
         self._joined_ns = None
 
     def _belongs_to_joined(self, stamp_ns: int) -> bool:
-        """Whether an image belongs to images that were joined already, or to earlier ones."""
+        """Whether an image of a camera that was absent is of the last time, or of earlier ones."""
         half = self._tracks[self._lead].period_ns / 2
         return self._joined_ns is not None and stamp_ns <= self._joined_ns + half
 
@@ -134,8 +138,7 @@ class StampJoiner:
 
     def _is_awaited(self, track: _Track, stamp_ns: int) -> bool:
         period_ns = self._tracks[self._lead].period_ns
-        lost = track.last_ns is None or track.last_ns < stamp_ns - _AWAITED * period_ns
-        return not lost and not track.is_decided(stamp_ns, period_ns)
+        return track.missed < _AWAITED and not track.is_decided(stamp_ns, period_ns)
 
     def _choose_lead(self) -> None:
         """Let the first camera with images lead where the present one is silent."""
@@ -158,6 +161,7 @@ class StampJoiner:
                 images[name] = item
                 track.is_late = False
             else:
+                track.missed += 1
                 absent[name] = LATE if track.is_late else NO_IMAGE
         mean_ns = stamp_ns + round(sum(at - stamp_ns for at, _ in images.values()) / len(images))
         self._joined_ns = stamp_ns

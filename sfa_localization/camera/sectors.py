@@ -36,6 +36,7 @@ FEATHER_DEG = 10.0
 """Width of a seam between two cameras: four cameras of 100 degrees overlap by so much."""
 _BOTH_DEG = 1.0  # pixels so far inside the views of two cameras compare their exposures
 _COMPARED = 300  # such pixels of a pair: their median is certain to a gray level
+_NEARLY = 0.95
 Part = NDArray[np.float32]
 
 
@@ -182,11 +183,16 @@ class SurroundView:
 
     def view(self, sizes: Mapping[str, tuple[int, int]]) -> View:
         """What cameras show, by the sizes (rows, columns) of their images. Raises CameraError."""
-        sectors = {name: self.sector(name, size) for name, size in sizes.items()}
-        key = frozenset(sectors)
-        if key not in self._views:
-            self._views[key] = self._view(sectors)
-        return self._views[key]
+        for name, size in sizes.items():
+            self.sector(name, size)
+        return self.of(frozenset(sizes))
+
+    def of(self, names: frozenset[str]) -> View:
+        """What cameras show whose sectors are known. Raises CameraError."""
+        if names not in self._views:
+            sectors = {name: self._sectors[name][1] for name in self.cameras if name in names}
+            self._views[names] = self._view(sectors)
+        return self._views[names]
 
     def _view(self, sectors: Mapping[str, Sector]) -> View:
         margins = {name: sector.margin_deg for name, sector in sectors.items()}
@@ -239,6 +245,23 @@ class SurroundView:
         if view.repeated is None:
             return panorama
         return np.asarray(panorama.reshape(-1, 3)[view.repeated.ravel()].reshape(size))
+
+
+def visible_elevations(cameras: Sequence[MountedCamera]) -> tuple[float, float]:
+    """The lowest and highest elevation, deg, that cameras see in nearly as many directions as they
+    see at any; 0, 0 where they see nothing.
+    """
+    whole = PanoramaConfig(360, 160, -80.0, 80.0)
+    rays = panorama_rays(whole).reshape(-1, 3)
+    seen = np.zeros(len(rays), bool)
+    for camera in cameras:
+        size = camera.lens.image_height, camera.lens.image_width
+        model = turned_camera(camera.lens, size, np.array(camera.rotation))
+        seen |= np.isfinite(model.project(rays)[:, 0])
+    share = seen.reshape(160, 360).mean(axis=1)
+    inside = np.flatnonzero(share >= _NEARLY * max(share.max(), 1e-9))
+    elevations = np.degrees(whole.sphere.elevations(160))[inside]
+    return float(elevations[-1]), float(elevations[0])
 
 
 def _arc(seen: Mask) -> Indices:

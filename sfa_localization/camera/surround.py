@@ -6,7 +6,7 @@ panoramas out. The nodes and the reading of bags both use it.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -59,6 +59,7 @@ class Surround:
         self._turns = TurnRates()
         self._shown: View | None = None
         self._stamp_ns = 0
+        self._uses: Counter[frozenset[str]] = Counter()
 
     @property
     def panorama(self) -> PanoramaConfig:
@@ -84,6 +85,15 @@ class Surround:
             if self._stamp_ns > trouble.since_ns + BRIDGED_S * 1e9
         ]
 
+    @property
+    def seen(self) -> Mask | None:
+        """Which pixels (H, W) most panoramas showed so far; None if all."""
+        if not self._uses:
+            return None
+        ((most, _),) = self._uses.most_common(1)
+        view = self._view.of(most)
+        return None if view.visible.all() else view.visible
+
     def check(self) -> None:
         """Raise CameraError for cameras that cannot be used, as far as their lenses tell."""
         sizes = {c.name: (c.lens.image_height, c.lens.image_width) for c in self.cameras}
@@ -97,14 +107,12 @@ class Surround:
         """Take an image (H, W, 3) uint8 of a camera; return the panoramas (H, W, 3) uint8, with
         their stamps, that are complete now. Raises CameraError for an image of another camera.
         """
+        self._view.sector(name, image.shape[:2])
         joined = self.join(name, stamp_ns, image)
         return [(images.stamp_ns, self.compose(images)) for images in joined]
 
     def join(self, name: str, stamp_ns: int, image: Image) -> list[Joined]:
-        """Take an image; return the images of one time that are complete now. Raises CameraError
-        for an image of another camera.
-        """
-        self._view.sector(name, image.shape[:2])
+        """Take an image; return the images of one time that are complete now."""
         return self._joiner.add(name, stamp_ns, image)
 
     def flush(self) -> list[Joined]:
@@ -129,6 +137,7 @@ class Surround:
         parts = self._view.parts(images, shifts)
         self._exposures.add(joined.stamp_ns, parts, view.overlaps)
         self._shown = view
+        self._uses[frozenset(images)] += 1
         return self._view.joined(parts, view, self._exposures.factors)
 
     def _report(self, reasons: Mapping[str, str], stamp_ns: int) -> None:
@@ -161,6 +170,12 @@ def place_of(cameras: Sequence[MountedCamera]) -> complex:
     """The place of their panorama on base_link, ahead + i left, m: the mean of the cameras'."""
     places = np.array([camera.place[:2] for camera in cameras])
     return complex(*places.mean(axis=0))
+
+
+def sentence(cameras: Sequence[MountedCamera]) -> str:
+    """Which cameras make one panorama, and where they look."""
+    looks = [f'{camera.name} {np.degrees(camera.yaw):.0f}' for camera in cameras]
+    return f'{len(cameras)} cameras are one panorama, looking to {", ".join(looks)} degrees of yaw'
 
 
 class TurnRates:

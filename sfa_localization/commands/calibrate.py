@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     text = calibration_files.calibration_text(lens)
     images = _images(arguments)
     if images:
-        panorama = fitting_panorama(PanoramaConfig(), learned) if learned else PanoramaConfig()
+        panorama = fitting_panorama(PanoramaConfig(), learned.sees) if learned else PanoramaConfig()
         # Also without --check, to prove that the calibration is usable.
         check = calibration.check_image(images[0], Unwrapper(CameraConfig(), panorama, lens))
         if arguments.check:
