@@ -2,26 +2,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several cameras live: what describes them, the panorama of their images, and faulty ones."""
 
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sfa_localization.camera import surround
+from sfa_localization.camera.calibration_files import calibration_text
 from sfa_localization.camera.lenses import turned_camera
 from sfa_localization.camera.panorama import panorama_rays
 from sfa_localization.camera.sectors import MountedCamera, optical_pose
 from sfa_localization.camera.settings import LensCalibration, PanoramaConfig, SurroundConfig
+from sfa_localization.config import load_settings
 from sfa_localization.data.errors import ConfigError
 
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from nav_msgs.msg import Odometry
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros_bench import standing, until
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import String
 
 from sfa_localization.data.messages import read_stamp
@@ -37,7 +40,7 @@ pytestmark = pytest.mark.ros
 PANORAMA = PanoramaConfig(width=120, height=12)
 SMALL = {'width': 120, 'height': 12}
 START_NS, STEP_NS = 12_000_000_000, 100_000_000
-WALKS = {'front': 0.0, 'left': 90.0, 'rear': 180.0, 'right': 270.0}
+YAWS = {'front': 0.0, 'left': 90.0, 'rear': 180.0, 'right': 270.0}
 
 
 def color(rays, turn=0.0):
@@ -48,7 +51,7 @@ def color(rays, turn=0.0):
 
 
 def pinhole(width=160, height=120, fov_deg=100.0):
-    focal = width / 2 / np.tan(np.radians(fov_deg / 2))
+    focal = float(width / 2 / np.tan(np.radians(fov_deg / 2)))
     return LensCalibration(
         image_width=width, image_height=height, fx=focal, fy=focal, cx=width / 2 - 0.5,
         cy=height / 2 - 0.5, xi=0.0, radius_min=0.0, radius_max=0.0, axis='forward', mirrored='no',
@@ -56,7 +59,7 @@ def pinhole(width=160, height=120, fov_deg=100.0):
 
 
 def fisheye(width=160, height=160, fov_deg=190.0):
-    focal = width / np.radians(fov_deg)
+    focal = float(width / np.radians(fov_deg))
     lens = pinhole(width, height)
     return replace(lens, camera_model='fisheye', fx=focal, fy=focal)
 
@@ -87,13 +90,13 @@ def poses(yaws):
 class Rig:
     """Cameras that look around, their node, and what it publishes."""
 
-    def __init__(self, bench, yaws=None, lens=None, topic='{}/image_raw', **parameters):
-        self.bench, self.yaws = bench, yaws or WALKS
-        self.lens, self.topic = lens or pinhole(), topic
+    def __init__(self, bench, yaws=None, lens=None, node=None, **parameters):
+        self.bench, self.yaws = bench, yaws or YAWS
+        self.lens = lens or pinhole()
         self.number, self.skew_ns = 0, dict.fromkeys(self.yaws, 0)
         given = {'cameras': [*self.yaws], 'camera_poses': poses(self.yaws.values())}
         given = {name: value for name, value in (SMALL | given | parameters).items() if value}
-        self.node = bench.run(OmnicamNode, **given)
+        self.node = node or bench.run(OmnicamNode, **given)
         self.heard = bench.listen(Image, 'panorama')
         self.troubles = bench.listen(String, 'panorama/troubles', latched_qos())
 
@@ -111,23 +114,21 @@ class Rig:
         for name, yaw in self.yaws.items():
             if name in without:
                 continue
-            image = picture(self.lens, yaw, 0.01 * self.number)
+            image = picture(self.lens, yaw, self.turn_at(stamp_ns))
             image = make(name, image) if make else image
             sent = to_image(image, stamp_ns + self.skew_ns[name], f'{name}_optical_frame')
             monitor = self.node.monitors[f'{name}/image_raw']
             before = monitor.received
-            self.bench.publish(self.topic.format(name), sent)
+            self.bench.publish(f'{name}/image_raw', sent)
             assert until(lambda m=monitor, b=before: m.received > b)
         return stamp_ns
 
-    def connect(self):
-        """Wait until the node receives images of all cameras."""
-        topics = [self.topic.format(name) for name in self.yaws]
-        assert until(lambda: all(self.node.count_subscribers(topic) for topic in topics))
-        for name, topic in zip(self.yaws, topics, strict=True):
-            sent = to_image(picture(self.lens, 0.0), 1, 'x')
-            monitor = self.node.monitors[f'{name}/image_raw']
-            assert self.bench.publish_until(topic, sent, lambda m=monitor: m.received)
+    def turn_at(self, stamp_ns):
+        """By which angle the world is turned at a stamp, rad."""
+        return 0.01 * (stamp_ns - START_NS) / STEP_NS
+
+    def health(self):
+        return self.node.health()
 
     def next(self, **options):
         """Send until another panorama is heard; the last one, (H, W, 3), and its stamp."""
@@ -137,9 +138,253 @@ class Rig:
             if until(lambda: len(self.heard) > count, 0.3):
                 break
         last = self.heard[-1]
-        data = np.frombuffer(last.data, np.uint8).reshape(last.height, last.width, 3)
-        return data, read_stamp(last.header.stamp), stamp_ns
+        return pixels(last), read_stamp(last.header.stamp), stamp_ns
 
 
-def expected(turn):
-    return color(panorama_rays(PANORAMA), turn)
+def pixels(message):
+    """The image (H, W, 3) of a message."""
+    return np.frombuffer(message.data, np.uint8).reshape(message.height, message.width, 3)
+
+
+def closeness(panorama, turn):
+    """The mean difference, gray levels, between a panorama and what the cameras look at."""
+    return np.abs(panorama - color(panorama_rays(PANORAMA), turn)).mean()
+
+
+@pytest.mark.parametrize(('yaws', 'lens'), [
+    (YAWS, pinhole()),
+    ({'front': 0.0, 'rear': 180.0}, fisheye()),
+])  # fmt: skip
+def test_one_panorama_of_lenses_by_camera_info_and_places_by_a_parameter(bench, yaws, lens):
+    """It has the mean stamp; before all are described images are refused, with the remedy."""
+    rig = Rig(bench, yaws, lens)
+    last = [*yaws][-1]
+    rig.describe(*[*yaws][:-1])
+    rig.send()
+    refused = rig.node.monitors['front/image_raw'].refused
+    assert until(lambda: refused)
+    (reason,) = refused
+    assert reason == f'no camera_info of {last}: publish it, or set camera_files'
+    rig.describe(last)
+    rig.skew_ns['front'] = 8_000_000
+    panorama, stamp_ns, sent_ns = rig.next()
+    assert closeness(panorama, rig.turn_at(stamp_ns)) < 3
+    assert closeness(panorama, rig.turn_at(stamp_ns) + 0.3) > 6
+    mean_ns = 8_000_000 // len(yaws)
+    assert (stamp_ns - mean_ns) % STEP_NS == START_NS % STEP_NS and stamp_ns <= sent_ns + mean_ns
+    assert rig.heard[-1].header.frame_id == 'omnicam'
+    level, text, values = rig.health()
+    assert (level, text) == (DiagnosticStatus.OK, 'running')
+    assert values['panorama visible [%]'] == '100' and values['camera front'] == 'used'
+
+
+def test_lenses_of_files_beside_the_parameter_file(bench, tmp_path):
+    (tmp_path / 'lens.yaml').write_text(calibration_text(pinhole()))
+    file = tmp_path / 'parameters.yaml'
+    listed = ', '.join(YAWS), ', '.join(['lens.yaml'] * 4), poses(YAWS.values())
+    file.write_text('omnicam_node: {{ros__parameters: {{cameras: [{}], camera_files: [{}], '
+                    'camera_poses: {}}}}}'.format(*listed))  # fmt: skip
+    words = ['--ros-args', '--params-file', str(file)]
+    node = bench.run(OmnicamNode, False, options={'cli_args': words}, **SMALL)
+    node.find_files(words)
+    assert node.start(), node.failure
+    assert load_settings(file, 'omnicam_node', SurroundConfig).camera_files == (
+        str(tmp_path / 'lens.yaml'),
+    ) * 4  # fmt: skip
+    rig = Rig(bench, node=node)
+    panorama, stamp_ns, _ = rig.next()
+    assert closeness(panorama, rig.turn_at(stamp_ns)) < 3
+
+
+def static(parent, frame, pose):
+    """A static transform as a message has it."""
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    rotation, moved = (
+        SimpleNamespace(x=x, y=y, z=z, w=w),
+        dict(zip('xyz', pose[:3, 3], strict=True)),
+    )
+    transform = SimpleNamespace(translation=SimpleNamespace(**moved), rotation=rotation)
+    header = SimpleNamespace(frame_id=parent)
+    return SimpleNamespace(header=header, child_frame_id=frame, transform=transform)
+
+
+def test_places_by_static_transforms(bench, monkeypatch):
+    """Also over frames between, and from the frame that the odometry names."""
+    sent, add = {}, TransformTree.add
+    monkeypatch.setattr(surround_input, 'TFMessage', String)
+    monkeypatch.setattr(TransformTree, 'add', lambda tree, text: add(tree, sent[text.data]))
+    rig = Rig(bench, camera_poses=None)
+    rig.describe()
+    rig.send()
+    refused = rig.node.monitors['rear/image_raw'].refused
+    assert until(lambda: refused)
+    names = ', '.join(YAWS)
+    assert [*refused] == [
+        f'no pose of {names} on /tf_static from base_link: publish it, or set camera_poses'
+    ]
+    mast = optical_pose((0.1, 0.0, 0.0), (0.0, 0.0, 90.0)) @ np.linalg.inv(np.eye(4))
+    links = [static('robot', 'mast', mast)]
+    for name, yaw in YAWS.items():
+        pose = np.linalg.solve(mast, optical_pose((0.2, 0.0, 0.5), (0.0, 0.0, yaw)))
+        links.append(static('mast', f'{name}_optical_frame', pose))
+    sent['first'] = SimpleNamespace(transforms=links[:3])
+    sent['second'] = SimpleNamespace(transforms=links[3:])
+    qos = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    for text in sent:
+        bench.publish('/tf_static', String(data=text), qos)
+    wheels = standing(START_NS)
+    wheels.child_frame_id = 'robot'
+    used = rig.node.monitors['odom']
+    assert bench.publish_until('odom', wheels, lambda: used.used)
+    panorama, stamp_ns, _ = rig.next()
+    assert closeness(panorama, rig.turn_at(stamp_ns)) < 3
+    places = [camera.place for camera in rig.node.around.surround.cameras]
+    assert np.allclose(places, [(0.2, 0.0, 0.5)] * 4)
+
+
+@pytest.mark.parametrize(('trouble', 'reason'), [
+    ('black', 'image is dark'),
+    ('frozen', 'camera is frozen: it repeats its image'),
+    ('gone', 'it sends no images'),
+])  # fmt: skip
+def test_a_faulty_camera_is_hidden_and_named_until_it_is_back(bench, trouble, reason):
+    """The panorama repeats what the others see; after some seconds the pose is doubted."""
+    rig = Rig(bench)
+    rig.describe()
+    rig.next()
+    filter_node = bench.run(EkfNode)
+    still = picture(rig.lens, 180.0)
+
+    def faulty(name, image):
+        if name != 'rear' or trouble == 'gone':
+            return image
+        return 0 * image if trouble == 'black' else still
+
+    without = ['rear'] if trouble == 'gone' else []
+    named = f'camera rear: {reason}'
+    for _ in range(60):
+        rig.send(without, faulty)
+        if until(lambda: rig.troubles and rig.troubles[-1].data == named, 0.05):
+            break
+    lasted_s = rig.number * STEP_NS * 1e-9
+    assert lasted_s > surround.BRIDGED_S
+    level, text, values = rig.health()
+    assert (level, text) == (DiagnosticStatus.WARN, named) and values['camera rear'] == reason
+    assert 70 < float(values['panorama visible [%]']) < 85
+    last = pixels(rig.heard[-1])
+    behind = np.r_[0:8, -8:0]
+    assert np.abs(np.diff(last[6].astype(int), axis=0))[behind].max() < 30
+    assert last.std() > 10 and last[:, behind].mean() > 40, 'no black sector'
+    assert until(lambda: named in filter_node.status().reasons)
+    for _ in range(20):
+        rig.send()
+        if until(lambda: rig.troubles[-1].data == '', 0.05):
+            break
+    assert until(lambda: named not in filter_node.status().reasons)
+    assert rig.health()[1] == 'running'
+
+
+def test_one_dark_image_of_a_camera_is_no_reason_to_doubt_the_pose(bench):
+    rig = Rig(bench)
+    rig.describe()
+    rig.next()
+    for _ in range(3):
+        rig.send(make=lambda name, image: 0 * image if name == 'left' else image)
+    assert until(lambda: rig.health()[1] == 'camera left: image is dark')
+    for _ in range(3):
+        rig.send()
+    assert until(lambda: rig.health()[1] == 'running')
+    assert rig.troubles == []
+
+
+def test_an_image_of_another_camera_is_refused_and_the_others_go_on(bench):
+    rig = Rig(bench)
+    rig.describe()
+    rig.next()
+    count = len(rig.heard)
+    for _ in range(8):
+        rig.send(make=lambda name, image: image[:50] if name == 'left' else image)
+    (reason,) = rig.node.monitors['left/image_raw'].refused
+    assert reason.startswith('the image is 160 x 50 but the camera is calibrated for 160 x 120')
+    assert until(lambda: len(rig.heard) >= count + 4)
+    assert rig.health()[1] == 'camera left: it sends no images'
+
+
+def test_images_are_compressed_where_only_these_are_published(bench, monkeypatch):
+    """A topic of another camera is no substitute."""
+    monkeypatch.setattr(discovery, 'PATIENCE_S', 0.0)
+    yaws = {'front': 0.0, 'rear': 180.0}
+    node = bench.run(OmnicamNode, cameras=[*yaws], camera_poses=poses(yaws.values()), **SMALL)
+    bench.listen(Image, 'panorama')
+    sent = to_compressed(picture(fisheye(), 0.0), START_NS, 'x', 90)
+    monitor = node.monitors['front/image_raw']
+    assert bench.publish_until('/front/image_raw/compressed', sent, lambda: monitor.received)
+    assert node.full_name('front/image_raw') == '/front/image_raw/compressed'
+    node.around.look()
+    assert node.full_name('rear/image_raw') == '/rear/image_raw'
+
+
+def test_nobody_listens_nothing_is_received(bench):
+    node = bench.run(OmnicamNode, cameras=[*YAWS], camera_poses=poses(YAWS.values()), **SMALL)
+    assert node.health()[1].startswith('idle') and node.count_subscribers('rear/image_raw') == 0
+    topics = 'rear/image_raw', 'rear/camera_info', 'odom'
+    for _ in range(2):
+        listener = bench.node.create_subscription(Image, 'panorama', lambda _: None, 1)
+        assert until(lambda: all(map(node.count_subscribers, topics)))
+        bench.do(bench.node.destroy_subscription, listener)
+        assert until(lambda: not any(map(node.count_subscribers, topics)))
+
+
+def test_sectors_are_hidden_while_it_runs(bench):
+    rig = Rig(bench)
+    rig.describe()
+    rig.next()
+    (done,) = rig.node.set_parameters([Parameter('blind_sectors', value=[-180.0, 180.0])])
+    assert not done.successful and 'blind_sectors hide all' in done.reason
+    (done,) = rig.node.set_parameters([Parameter('blind_sectors', value=[-30.0, 30.0])])
+    assert done.successful
+    panorama, _, _ = rig.next()
+    assert np.array_equal(panorama[:, 55], panorama[:, 52]), 'repeated from the edge of the sector'
+    assert until(lambda: rig.health()[2]['panorama visible [%]'] == '83')
+
+
+def test_cameras_of_the_model_are_used(bench, trained, tmp_path):
+    """Their names may be left out, and others are refused."""
+    mounted = tuple(
+        MountedCamera.at(name, pinhole(), optical_pose((0.0, 0.0, 0.5), (0.0, 0.0, yaw)))
+        for name, yaw in YAWS.items()
+    )
+    model, path = PlaceModel.load(trained.model), tmp_path / 'model.npz'
+    replace(model, surround=mounted).save(path)
+    node = bench.run(OmnicamNode, model=str(path))
+    rig = Rig(bench, node=node)
+    panorama, stamp_ns, _ = rig.next()
+    rays = panorama_rays(model.panorama)
+    assert np.abs(panorama - color(rays, rig.turn_at(stamp_ns))).mean() < 3
+    other = bench.run(OmnicamNode, False, model=str(path), cameras=['front', 'back'])
+    assert not other.start()
+    assert other.failure == (
+        'cameras: the model was trained on front, left, rear, right; name these, or none'
+    )
+
+
+@pytest.mark.parametrize(('parameters', 'why'), [
+    ({'cameras': ['front']}, '1 cameras: give 2 to 8'),
+    ({'cameras': ['front', 'front']}, 'two cameras have one name'),
+    ({'camera_model': 'mirror'}, 'are for one camera, but there are several'),
+    ({'source': 'video', 'source_path': 'x.mp4'}, 'are for one camera, but there are several'),
+    ({'camera_files': ['/nowhere.yaml', '/nowhere.yaml']}, '/nowhere.yaml: No such file'),
+])  # fmt: skip
+def test_parameters_that_fit_no_cameras_are_refused(bench, parameters, why):
+    node = bench.run(OmnicamNode, False, **{'cameras': ['front', 'rear'], **parameters})
+    assert not node.start() and why in node.failure
+
+
+@pytest.mark.parametrize(('parameters', 'why'), [
+    ({'camera_poses': [0.0] * 7}, 'camera_poses: 7 numbers; give six for each camera'),
+    ({'camera_files': ['a.yaml']}, 'camera_files: 1 for 2 cameras'),
+    ({'cameras': [1.0, 2.0]}, 'is not a text'),
+])  # fmt: skip
+def test_lists_of_another_length_or_kind_are_refused(bench, parameters, why):
+    with pytest.raises(ConfigError, match=why):
+        bench.run(OmnicamNode, False, **{'cameras': ['front', 'rear'], **parameters})

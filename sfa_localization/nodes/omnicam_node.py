@@ -77,7 +77,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._losses = 0
         self._listening_since_s: float | None = None
         self._images: ImageInput | None = None
-        self._around: SurroundInput | None = None
+        self.around: SurroundInput | None = None
         self._told_troubles = ''
         self._calibrations: Any = None
         self._lens: LensCalibration | None = None
@@ -137,7 +137,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
             )
         latched = lifecycle.latched_qos()
         self._troubles = self.publisher(String, self.following('panorama/troubles'), latched)
-        self._around = SurroundInput(
+        self.around = SurroundInput(
             self,
             self._config.image_transport,
             self.settings(SurroundConfig),
@@ -145,7 +145,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
             partial(self._new_surround, self._settings),
             self._publish_joined,
         )
-        self._input = self._around.topics[self._around.names[0]]
+        self._input = self.around.topics[self.around.names[0]]
 
     def _new_surround(self, settings: Current, cameras: Sequence[MountedCamera]) -> Surround:
         """What makes panoramas of cameras. Raises CameraError."""
@@ -204,8 +204,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
             self._start_listening()
 
     def _start_listening(self) -> None:
-        if self._around is not None:
-            self._around.start()
+        if self.around is not None:
+            self.around.start()
         if self._images is not None:
             self._images.start(*self._substitute)
             if self._lens is None and not self.settings(CameraConfig).is_described:
@@ -251,8 +251,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def _stop_listening(self) -> None:
         if self._images is not None:
             self._images.stop()
-        if self._around is not None:
-            self._around.stop()
+        if self.around is not None:
+            self.around.stop()
         self.unsubscribe(self._calibrations)
         self._listening_since_s = self._calibrations = None
 
@@ -307,10 +307,10 @@ class OmnicamNode(lifecycle.LocalizationNode):
 
     def _publish_joined(self, stamp_ns: int, panorama: Image) -> None:
         """Publish a panorama of several cameras, and what it lacks if that has changed."""
-        assert self._around is not None and self._around.surround is not None
+        assert self.around is not None and self.around.surround is not None
         self._publish(stamp_ns, panorama, '')
         self._frozen.add(panorama)
-        troubles = '; '.join(self._around.surround.problems)
+        troubles = '; '.join(self.around.surround.problems)
         if troubles != self._told_troubles:
             self._told_troubles = troubles
             self._troubles.publish(String(data=troubles))
@@ -332,8 +332,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         """Raises LocalizationError for a mask, sector, mount or elevation that hides all."""
         if all(settings[kind] == self._settings[kind] for kind in (CameraConfig, PanoramaConfig)):
             return
-        if self._around is not None and self._around.surround is not None:
-            self._new_surround(settings, self._around.surround.cameras)
+        if self.around is not None and self.around.surround is not None:
+            self._new_surround(settings, self.around.surround.cameras)
         else:
             self._new_unwrapper(settings, self._lens).check(self._size)
 
@@ -342,8 +342,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
             self._feed.config = settings
         elif isinstance(settings, (CameraConfig, PanoramaConfig)):
             self._unwrapper = self._new_unwrapper(self._settings, self._lens)
-            if self._around is not None:
-                self._around.remake()
+            if self.around is not None:
+                self.around.remake()
             if self.active:
                 self._info.publish(convert.to_info(self._panorama))
 
@@ -375,9 +375,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
             return OK, 'idle: nobody listens to the panorama'
         listening_s = steady_s() - self._listening_since_s
         patience_s = self.settings(CaptureConfig).silence_timeout
-        if self._around is not None:
-            waits = listening_s < patience_s
-            return (OK, 'waiting for images') if waits else self._around.judge(details, patience_s)
+        if self.around is not None:
+            return self.around.judge(details, patience_s, listening_s)
         silent_s = min(self.monitors[self._input].silent_for_s(), listening_s)
         if silent_s > patience_s:
             silent = f'no image on {self.full_name(self._input)} for {silent_s:.0f} s'

@@ -201,20 +201,26 @@ class SurroundInput:
         if self.surround is not None:
             self.surround = self._make(self.surround.cameras)
 
+    def look(self) -> None:
+        """Look for other transports of the images that nobody publishes."""
+        for search in self._searches.values():
+            search.look()
+
     # State.
 
-    def silent_for_s(self) -> float:
-        """Seconds since the last image of any camera."""
-        return min(self._node.monitors[topic].silent_for_s() for topic in self.topics.values())
-
-    def judge(self, details: dict[str, str], patience_s: float) -> tuple[int, str]:
-        """Diagnostic level and text, '' if all is well; cameras may be silent for `patience_s`."""
-        if self.silent_for_s() > patience_s:
+    def judge(
+        self, details: dict[str, str], patience_s: float, listening_s: float
+    ) -> tuple[int, str]:
+        """Diagnostic level and text, '' if all is well, after `listening_s` seconds; all cameras
+        may be silent for `patience_s`.
+        """
+        silent = [self._node.monitors[topic].silent_for_s() for topic in self.topics.values()]
+        if min(*silent, listening_s) > patience_s:
             names = ', '.join(map(self._node.full_name, self.topics.values()))
             hints = [search.hint for search in self._searches.values() if search.hint]
             return ERROR, '; '.join(hints) or f'no image on {names}'
         if self.surround is None:
-            return ERROR, self.missing()
+            return ERROR if listening_s > patience_s else WARN, self.missing()
         troubles = self.surround.troubles
         for name in self.names:
             details[f'camera {name}'] = troubles[name].reason if name in troubles else 'used'
