@@ -22,7 +22,7 @@ LATE = 'its images come after those of the next time'
 _STEPS = 9
 """Intervals of a camera, of which the median is its period: a lost image doubles one."""
 _AWAITED = 3
-"""Times without an image for which a camera is waited for: each wait costs a period at most."""
+"""Times in a row that a camera without images is waited for: each costs a period at most."""
 _SILENT = 1.5
 """Periods after which a silent camera no longer leads: one image is lost for certain."""
 
@@ -39,15 +39,14 @@ class Joined(NamedTuple):
 
 @dataclass(slots=True)
 class _Track:
-    """The images of a camera that wait, the steps of its stamps, ns, and for how many times it has
-    had no image.
-    """
+    """The images of a camera that wait, and the steps of its stamps, ns."""
 
     waiting: deque[tuple[int, Image]] = field(default_factory=deque)
     steps: deque[int] = field(default_factory=lambda: deque(maxlen=_STEPS))
     last_ns: int | None = None
     is_late: bool = False
-    missed: int = 0
+    absences: int = 0
+    """Times in a row for which no image came."""
 
     @property
     def period_ns(self) -> float:
@@ -92,7 +91,7 @@ class StampJoiner:
             else:
                 track.steps.append(stamp_ns - track.last_ns)
         track.last_ns = stamp_ns
-        track.missed = 0
+        track.absences = 0
         if name in self._absent and self._belongs_to_joined(stamp_ns):
             track.is_late = True
         else:
@@ -138,7 +137,7 @@ class StampJoiner:
 
     def _is_awaited(self, track: _Track, stamp_ns: int) -> bool:
         period_ns = self._tracks[self._lead].period_ns
-        return track.missed < _AWAITED and not track.is_decided(stamp_ns, period_ns)
+        return track.absences < _AWAITED and not track.is_decided(stamp_ns, period_ns)
 
     def _choose_lead(self) -> None:
         """Let the first camera with images lead where the present one is silent."""
@@ -161,7 +160,7 @@ class StampJoiner:
                 images[name] = item
                 track.is_late = False
             else:
-                track.missed += 1
+                track.absences += 1
                 absent[name] = LATE if track.is_late else NO_IMAGE
         mean_ns = stamp_ns + round(sum(at - stamp_ns for at, _ in images.values()) / len(images))
         self._joined_ns = stamp_ns
