@@ -182,7 +182,11 @@ def test_the_table_of_topics_is_that_of_the_nodes(bench, monkeypatch):
 
     def topics_of(entities):
         return {
-            (entity.topic_name[1:].replace('NAME2', 'NAME'), entity.msg_type.__name__, f' `{node.get_name()}` ')
+            (
+                entity.topic_name[1:].replace('NAME2', 'NAME'),
+                entity.msg_type.__name__,
+                f' `{node.get_name()}` ',
+            )
             for node in nodes for entity in getattr(node, entities)
             if not OTHER_TOPICS.fullmatch(entity.topic_name)
         }  # fmt: skip
