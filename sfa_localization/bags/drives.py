@@ -8,7 +8,7 @@ import functools
 import itertools
 import logging
 import tempfile
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -52,6 +52,7 @@ ODOMETRY_TOLERANCE_S = 0.5
 """An image is used when odometry before and after it is this near (s); poses are not interpolated
 over a longer pause."""
 _SAME_IMAGE_NS = 1_000_000  # stamps of one image differ by less
+_WARM_UP_NS = 3_000_000_000  # of images beside a panorama: exposures and periods are known then
 logger = logging.getLogger(__name__)
 R = TypeVar('R', bound='ReadingRecipe')
 
@@ -426,11 +427,30 @@ def _leveled(panoramas: Panoramas, imu: Stream, sphere: Sphere) -> Panoramas:
 
 
 def images_at(bag: Path, stamps_ns: Collection[int], recipe: ReadingRecipe) -> dict[int, Image]:
-    """Images (H, W, 3) of a bag, by stamps within a millisecond of theirs. Raises BagError."""
+    """Images (H, W, 3) of a bag, or panoramas of its several cameras, by stamps within a
+    millisecond of theirs. Raises BagError.
+    """
     images: dict[int, Image] = {}
     with Bag(bag, config=recipe.bag) as opened:
-        for stamp_ns, image in opened.images(recipe.topics.image) if stamps_ns else ():
+        for stamp_ns, image in _near(opened, stamps_ns, recipe) if stamps_ns else ():
             images |= {at: image for at in stamps_ns if abs(at - stamp_ns) <= _SAME_IMAGE_NS}
             if len(images) == len(stamps_ns):
                 break
     return images
+
+
+def _near(
+    bag: Bag, stamps_ns: Collection[int], recipe: ReadingRecipe
+) -> Iterator[tuple[int, Image]]:
+    """Stamps and images, or panoramas of several cameras near the given stamps."""
+    images = _images_of(bag, recipe)
+    if isinstance(images, _OneCamera):
+        yield from bag.images(recipe.topics.image)
+        return
+    panoramas, *cameras = images.streams(bag, images.panorama).values()
+    wanted = np.array([*stamps_ns], np.int64)
+    for camera in cameras:
+        camera.wanted = lambda at: bool(np.abs(wanted - at).min() < _WARM_UP_NS)
+    for stream, stamp_ns, image in bag.read(cameras):
+        if stream is panoramas:
+            yield stamp_ns, image

@@ -210,9 +210,10 @@ class SurroundStream:
         return stream
 
     def _add(self, name: str, item: Item) -> Iterator[Used]:
-        """Take an image of a camera; pass the panoramas that are complete."""
+        """Take an image of a camera; pass its stamp, and the panoramas that are complete."""
         self._receive_ns = item.receive_ns
-        return self._passed(self._surround.join(name, item.stamp_ns, item.value))
+        yield self.cameras[name], item.stamp_ns, None
+        yield from self._passed(self._surround.join(name, item.stamp_ns, item.value))
 
     def _close(self) -> Iterator[Used]:
         """Take the end of a camera; at that of the last, pass the rest. Raises BagError where there

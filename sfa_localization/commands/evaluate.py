@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from sfa_localization.fusion.settings import FilterConfig
 
 if TYPE_CHECKING:
     from sfa_localization.evaluation import Evaluation
+    from sfa_localization.place_model import PlaceModel
 
 logger = logging.getLogger(__name__)
 WRITES = """\
@@ -89,14 +91,14 @@ def run(arguments: argparse.Namespace) -> int:
     print(*count_lines(result.counts), sep='\n')
     print(f'aligned on {result.aligned_on}', *result.corrections, sep='\n')
     if arguments.report:
-        _write_report(arguments, result)
+        _write_report(arguments, model, result)
     if arguments.json:
         grade, sentence = judgment(result.scores, result.counts)
         write_json(arguments.json, {**result.as_dict(), 'grade': grade, 'sentence': sentence})
     return 0
 
 
-def _write_report(arguments: argparse.Namespace, result: Evaluation) -> None:
+def _write_report(arguments: argparse.Namespace, model: PlaceModel, result: Evaluation) -> None:
     """Write figures and the page; the worst images are read from the bag again."""
     from sfa_localization.bags.drives import images_at
     from sfa_localization.reports.evaluation import worst_of, write_evaluation_page, write_report
@@ -109,7 +111,9 @@ def _write_report(arguments: argparse.Namespace, result: Evaluation) -> None:
     late_ns = round(result.counts.get('camera_delay_s', 0.0) * 1e9)
     worst = worst_of(result.truth, result.estimates['sfa'])
     stamps = {image: stamp + late_ns for image, stamp in worst.items()}
-    read = images_at(arguments.bag, stamps.values(), options.recipe(arguments))
+    recipe = options.recipe(arguments)
+    recipe = replace(recipe, panorama=model.panorama, surround=model.surround)
+    read = images_at(arguments.bag, stamps.values(), recipe)
     samples = {image: read[stamp] for image, stamp in stamps.items() if stamp in read}
     title = f'{arguments.model.name} on {arguments.bag.name}'
     notes = f'The map is aligned on {result.aligned_on}.', *result.corrections
