@@ -90,9 +90,9 @@ def poses(yaws):
 class Rig:
     """Cameras that look around, their node, and what it publishes."""
 
-    def __init__(self, bench, yaws=None, lens=None, node=None, **parameters):
+    def __init__(self, bench, yaws=None, lens=None, node=None, step_rad=0.01, **parameters):
         self.bench, self.yaws = bench, yaws or YAWS
-        self.lens = lens or pinhole()
+        self.lens, self.step_rad = lens or pinhole(), step_rad
         self.number, self.skew_ns = 0, dict.fromkeys(self.yaws, 0)
         given = {'cameras': [*self.yaws], 'camera_poses': poses(self.yaws.values())}
         given = {name: value for name, value in (SMALL | given | parameters).items() if value}
@@ -114,9 +114,10 @@ class Rig:
         for name, yaw in self.yaws.items():
             if name in without:
                 continue
-            image = picture(self.lens, yaw, self.turn_at(stamp_ns))
+            taken_ns = stamp_ns + self.skew_ns[name]
+            image = picture(self.lens, yaw, self.turn_at(taken_ns))
             image = make(name, image) if make else image
-            sent = to_image(image, stamp_ns + self.skew_ns[name], f'{name}_optical_frame')
+            sent = to_image(image, taken_ns, f'{name}_optical_frame')
             monitor = self.node.monitors[f'{name}/image_raw']
             before = monitor.received
             self.bench.publish(f'{name}/image_raw', sent)
@@ -125,7 +126,7 @@ class Rig:
 
     def turn_at(self, stamp_ns):
         """By which angle the world is turned at a stamp, rad."""
-        return 0.01 * (stamp_ns - START_NS) / STEP_NS
+        return self.step_rad * (stamp_ns - START_NS) / STEP_NS
 
     def health(self):
         return self.node.health()
@@ -240,6 +241,26 @@ def test_places_by_static_transforms(bench, monkeypatch):
     assert closeness(panorama, rig.turn_at(stamp_ns)) < 3
     places = [camera.place for camera in rig.node.around.surround.cameras]
     assert np.allclose(places, [(0.2, 0.0, 0.5)] * 4)
+
+
+def test_images_of_different_times_are_moved_by_the_turn_between_them(bench):
+    """The odometry is of no use before: it is not received."""
+    rig = Rig(bench, step_rad=0.2)
+    rig.describe()
+    rig.next()
+    assert until(lambda: rig.node.count_subscribers('odom') == 0)
+    rig.skew_ns['front'] = 40_000_000
+    panorama, stamp_ns, _ = rig.next()
+    plain = closeness(panorama, rig.turn_at(stamp_ns))
+    used = rig.node.monitors['odom']
+    assert until(lambda: rig.node.count_subscribers('odom') == 1)
+    for number in range(40):
+        turning = standing(START_NS + (rig.number + number) * STEP_NS // 2)
+        turning.twist.twist.angular.z = 2.0
+        before = used.received
+        assert bench.publish_until('odom', turning, lambda b=before: used.received > b)
+    panorama, stamp_ns, _ = rig.next()
+    assert closeness(panorama, rig.turn_at(stamp_ns)) < 0.6 * plain
 
 
 @pytest.mark.parametrize(('trouble', 'reason'), [

@@ -78,6 +78,7 @@ class SurroundInput:
         self.surround = make(trained) if trained else None
         self._described: list[Any] = []
         self._odometry: Any = None
+        self._substitute_odometry = ''
         self._listens = False
         raw = transport == 'raw'
         self.topics = dict[str, str]()
@@ -94,7 +95,7 @@ class SurroundInput:
             take = partial(self._substitute, name)
             self._searches[name] = Discovery(node, topic, types, [base], take, fixed=True)
         odometry = ['nav_msgs/msg/Odometry']
-        Discovery(node, _ODOM, odometry, [_ODOM], self._listen_to_odometry)
+        Discovery(node, _ODOM, odometry, [_ODOM], self._take_odometry_of)
 
     # Subscriptions, while somebody listens.
 
@@ -103,17 +104,16 @@ class SurroundInput:
         self._listens = True
         for name, images in self._inputs.items():
             images.start(*self._substitutes[name])
-        self._listen_to_odometry()
         if self.surround is None:
             self._listen_to_descriptions()
+        self._follow_odometry()
 
     def stop(self) -> None:
         """End all subscriptions."""
         self._listens = False
         for images in self._inputs.values():
             images.stop()
-        self._node.unsubscribe(self._odometry)
-        self._odometry = None
+        self._follow_odometry()
         self._end_descriptions()
 
     def _substitute(self, name: str, topic: str, kind: str) -> None:
@@ -124,10 +124,25 @@ class SurroundInput:
             self._inputs[name].stop()
             self._inputs[name].start(topic, kind)
 
-    def _listen_to_odometry(self, substitute: str = '', _: str = '') -> None:
+    def _take_odometry_of(self, topic: str, _: str) -> None:
+        """Take odometry from a substitute for its topic."""
+        self._substitute_odometry = topic
+        self._node.require_input(_ODOM, topic)
         self._node.unsubscribe(self._odometry)
-        qos = sensor_qos(20)
-        self._odometry = self._node.subscribe(Odometry, _ODOM, self._take_turn, qos, substitute)
+        self._odometry = None
+        self._follow_odometry()
+
+    def _follow_odometry(self) -> None:
+        """Subscribe to the odometry while it is of use: its messages are the most frequent ones."""
+        is_of_use = self._listens and (self.surround is None or self.surround.is_skewed)
+        if is_of_use and self._odometry is None:
+            qos = sensor_qos(20)
+            topic = self._substitute_odometry
+            take = self._take_turn
+            self._odometry = self._node.subscribe(Odometry, _ODOM, take, qos, topic)
+        elif not is_of_use:
+            self._node.unsubscribe(self._odometry)
+            self._odometry = None
 
     def _listen_to_descriptions(self) -> None:
         """Subscribe to camera_info beside the images, and to /tf_static."""
@@ -168,6 +183,7 @@ class SurroundInput:
             raise MessageError(self.missing())
         for panorama_ns, panorama in self.surround.add(name, stamp_ns, image):
             self._use(panorama_ns, panorama)
+            self._follow_odometry()
 
     def _describe(self) -> None:
         """Begin with panoramas, if all cameras are described. Raises CameraError."""
