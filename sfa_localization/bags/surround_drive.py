@@ -14,7 +14,7 @@ import numpy as np
 from sfa_localization.bags import decoding
 from sfa_localization.bags.drives import ReadingRecipe
 from sfa_localization.bags.reader import Bag
-from sfa_localization.bags.surround_topics import SurroundStream, cameras_of, topics_like
+from sfa_localization.bags.surround_topics import PATIENCE, SurroundStream, cameras_of, topics_like
 from sfa_localization.bags.topic_stream import clock_offset
 from sfa_localization.camera.joining import Joined
 from sfa_localization.camera.lens_report import fitting_panorama
@@ -76,7 +76,7 @@ def _times(bag: Path, recipe: ReadingRecipe) -> tuple[list[Joined], Array]:
     """The stamps of the images of one time, without the images, and the poses (N, 3) then."""
     with Bag(bag, config=recipe.bag) as opened:
         topics = topics_like(opened, recipe.topics.image, recipe.surround)
-        around = Surround(recipe.surround, recipe.panorama)
+        around = Surround(recipe.surround, recipe.panorama, patience=PATIENCE)
         stream = SurroundStream(opened, topics, around, lambda joined: joined)
         for camera in stream.cameras.values():
             camera.images = None
