@@ -23,7 +23,9 @@ from scipy import signal, stats
 
 from sfa_localization.bags.drives import as_live, image_folder, read_drive
 from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.surround_drive import yaws_of
 from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.camera.yaws import KNOCKED_RAD
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import (
     Array,
@@ -142,6 +144,10 @@ def evaluate(
         fitted = drives[: len(align_bags) or 1]
         transform = fit_transform(*((d.true.poses, d.images.poses) for d in fitted))
     corrections = tuple(f'{d.run.name}: {text}' for d in drives for text in d.sentences)
+    if model.surround:
+        knocked = yaws_of(Path(bag), recipe, progress).sentences(KNOCKED_RAD)
+        remedy = 'of what it was in training: mount it as it was, or train again'
+        corrections += tuple(f'{drives[-1].run.name}: {text} {remedy}' for text in knocked)
     return _judged(drives[-1], localizer.filter, transform, aligned_on, corrections)
 
 

@@ -24,7 +24,7 @@ from sfa_localization.bags.lens_drive import lens_of
 from sfa_localization.bags.motion_arrays import stamps_of, to_yaw_rate
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import TopicNames
-from sfa_localization.bags.surround_topics import SurroundStream, cameras_of, topics_of
+from sfa_localization.bags.surround_topics import PATIENCE, SurroundStream, cameras_of, topics_of
 from sfa_localization.bags.topic_stream import Stream, by_one_clock
 from sfa_localization.camera import body, kinds, lens_report, surround
 from sfa_localization.camera.joining import Joined
@@ -377,7 +377,7 @@ class _Survey:
         """The stream of the panoramas of several cameras, and those of the cameras."""
         panorama = PanoramaConfig(clockwise=self._sphere.clockwise)
         panorama = lens_report.fitting_panorama(panorama, visible_elevations(cameras))
-        around = surround.Surround(cameras, panorama)
+        around = surround.Surround(cameras, panorama, patience=PATIENCE)
 
         def take(images: Joined) -> _View:
             return self._take(around.compose(images))

@@ -13,13 +13,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from sfa_localization.bags.drives import ReadingRecipe
-from sfa_localization.bags.lens_drive import lens_of, with_cameras
+from sfa_localization.bags.lens_drive import lens_of
+from sfa_localization.bags.surround_drive import with_cameras, yaws_of
 from sfa_localization.camera import body, lens_report
 from sfa_localization.camera.kinds import require_single_view
 from sfa_localization.camera.learned_lens import PLACE_STD_M, LearnedLens
 from sfa_localization.camera.leveling import MaskedPanoramas, leaning
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.camera.surround import sentence
 from sfa_localization.camera.turns import headings, turns_and_textures
 from sfa_localization.data.errors import CameraError, DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
@@ -191,12 +191,14 @@ def with_lens(
 
     A described lens stays, and is compared with that of the drive. Raises BagError, and CameraError
     where no bag shows the lens of images that are no panoramas. Several cameras around the robot
-    have the lenses of their camera_info.
+    have the lenses of their camera_info, and yaws that the drive corrects.
     """
     around = with_cameras(bags[0], recipe)
     if around.surround:
-        logger.info('%s: %s', bags[0], sentence(around.surround))
-        return around, None
+        yaws = yaws_of(bags[0], around, progress)
+        for text in yaws.sentences():
+            logger.warning('%s: %s of what /tf_static says: taken into account', bags[0], text)
+        return replace(around, surround=yaws.corrected(around.surround)), None
     lens = None
     problems = list[CameraError]()
     for bag in bags:

@@ -22,7 +22,7 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.satellite_fixes import in_plane
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.static_transforms import lever_arm
-from sfa_localization.bags.surround_topics import SurroundStream, topics_like
+from sfa_localization.bags.surround_topics import PATIENCE, SurroundStream, topics_like
 from sfa_localization.bags.topic_stream import Item, Stream, Used, by_one_clock
 from sfa_localization.camera.joining import Joined
 from sfa_localization.camera.leveling import LeveledPanoramas, tilts_at
@@ -268,7 +268,7 @@ class _SeveralCameras:
 
     def __init__(self, bag: Bag, recipe: ReadingRecipe, topics: Mapping[str, str]) -> None:
         camera = recipe.camera
-        self._surround = Surround(recipe.surround, recipe.panorama, camera.blind_sectors)
+        self._surround = Surround(recipe.surround, recipe.panorama, camera.blind_sectors, PATIENCE)
         self._surround.check()
         self._topics = topics
         self.total = max(bag.topics[topic].count for topic in topics.values())

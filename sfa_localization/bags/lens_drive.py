@@ -4,9 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -14,20 +12,16 @@ from sfa_localization.bags import decoding
 from sfa_localization.bags.drives import ReadingRecipe
 from sfa_localization.bags.motion_arrays import stamps_of
 from sfa_localization.bags.reader import Bag
-from sfa_localization.bags.surround_topics import cameras_of
 from sfa_localization.bags.topic_stream import clock_offset
 from sfa_localization.camera.learned_lens import LearnedLens, learn_lens
 from sfa_localization.camera.lens_guess import LensGuess
-from sfa_localization.camera.lens_report import fitting_panorama
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.camera.point_tracks import PointTracker, Tracks, chosen_images
-from sfa_localization.camera.sectors import visible_elevations
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.progress import progress_over
 from sfa_localization.data.run import Image, Stamps, Trajectory
 from sfa_localization.data.statistics import evenly
 
-R = TypeVar('R', bound=ReadingRecipe)
 TITLE = 'learn the lens'
 _SAMPLES = 16  # images from all over the drive: they show the rim, and what does not change
 
@@ -50,25 +44,6 @@ def lens_of(bag: Path, recipe: ReadingRecipe, progress: bool = False) -> Learned
         return learn_lens(tracks, odometry, guess, samples)
     except CameraError as error:
         raise CameraError(f'{bag}: {error}') from None
-
-
-def with_cameras(bag: Path, recipe: R) -> R:
-    """The recipe with the cameras around the robot whose images a bag has on several topics, and
-    the elevations that they see; the same for one camera. Raises BagError.
-    """
-    with Bag(bag, config=recipe.bag) as opened:
-        odometry = opened.find('odometry', recipe.topics.odometry)
-        cameras = cameras_of(opened, recipe.topics.image, odometry)
-    if not cameras:
-        return recipe
-    camera = recipe.camera
-    if camera.is_described or camera.mask_file or any(camera.mount_rpy):
-        raise CameraError(
-            f'{bag}: camera_model, calibration_file, mount_rpy and mask_file are of one camera: '
-            'leave them out, as several have camera_info and /tf_static; blind_sectors hide parts'
-        )
-    panorama = fitting_panorama(recipe.panorama, visible_elevations(cameras))
-    return replace(recipe, surround=cameras, panorama=panorama)
 
 
 def _stamps(bag: Path, recipe: ReadingRecipe) -> tuple[Stamps, Trajectory]:

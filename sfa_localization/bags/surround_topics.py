@@ -31,6 +31,8 @@ BASE = 'base_link'
 """The frame of the robot where the odometry does not name it."""
 BETWEEN = ','
 """Between the names of several topics in an option or parameter."""
+PATIENCE = 10
+"""Later images for which one is waited: a stream holds an image back until its next one."""
 _COUNTED = 10  # messages of each topic that show its rate
 _SAME_RATE = 1.5
 _SAME_DIRECTION_DEG = 20.0  # between the optical axes of a stereo pair, or of color and depth
@@ -93,8 +95,9 @@ def cameras_of(bag: Bag, named: str, odometry: str) -> tuple[MountedCamera, ...]
         return ()
     survey = _Survey(bag, [*topics.values()], odometry)
     problems = survey.problems()
+    cameras = list[MountedCamera]()
     try:
-        cameras = [survey.camera(name, topic) for name, topic in topics.items()] * (not problems)
+        cameras += [survey.camera(name, topic) for name, topic in topics.items() if not problems]
     except CameraError as error:
         problems.append(str(error))
     problems = problems or _alike(cameras)

@@ -72,9 +72,12 @@ class _Track:
 
 
 class StampJoiner:
-    """Joins the images of cameras, 2 or more, by their `names`."""
+    """Joins the images of cameras, 2 or more, by their `names`; those of a time are given up when
+    `patience` later images of the leading camera have come.
+    """
 
-    def __init__(self, names: Sequence[str]) -> None:
+    def __init__(self, names: Sequence[str], patience: int = 1) -> None:
+        self._patience = patience
         self._tracks = {name: _Track() for name in names}
         self._lead = names[0]
         self._absent: dict[str, str] = {}
@@ -127,7 +130,7 @@ class StampJoiner:
         if not lead.waiting or not (period_ns or ended):
             return None
         stamp_ns = lead.waiting[0][0]
-        is_over = ended or len(lead.waiting) > 1
+        is_over = ended or len(lead.waiting) > self._patience
         if not is_over and any(self._is_awaited(track, stamp_ns) for track in self._others()):
             return None
         return self._join(stamp_ns, period_ns / 2)

@@ -181,6 +181,10 @@ class SurroundView:
             self._views.clear()
         return self._sectors[name][1]
 
+    def known(self, name: str) -> Sector:
+        """The sector of a camera for the last size of its images."""
+        return self._sectors[name][1]
+
     def view(self, sizes: Mapping[str, tuple[int, int]]) -> View:
         """What cameras show, by the sizes (rows, columns) of their images. Raises CameraError."""
         for name, size in sizes.items():

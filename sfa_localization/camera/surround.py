@@ -43,7 +43,8 @@ class Surround:
     """Makes panoramas of the images of 2 to 8 `cameras`.
 
     A camera that is late, missing, frozen, dark or covered is named in `troubles`, and its sector
-    is hidden: it repeats the nearest pixels that others see, as `visible` says.
+    is hidden: it repeats the nearest pixels that others see, as `visible` says. A missing image is
+    waited for until `patience` later ones of another camera have come.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class Surround:
         cameras: Sequence[MountedCamera],
         panorama: PanoramaConfig,
         blind_sectors: tuple[float, ...] = (),
+        patience: int = 1,
     ) -> None:
         names = [camera.name for camera in cameras]
         require_rig(names)
@@ -59,7 +61,7 @@ class Surround:
         self.is_skewed = False
         """Whether cameras have taken images at different times, so that turns correct them."""
         self._view = SurroundView(cameras, panorama, blind_sectors)
-        self._joiner = StampJoiner(names)
+        self._joiner = StampJoiner(names, patience)
         self._watches = {name: ImageWatch() for name in names}
         self._exposures = Exposures(names)
         self._turns = TurnRates()
