@@ -24,9 +24,7 @@ FEWEST_CAMERAS = 2
 MOST_CAMERAS = 8
 BRIDGED_S = 3.0
 """Seconds for which the panorama may lack a camera, before that is a reason to doubt the pose."""
-_WATCHED = (
-    2  # every second pixel shows whether a camera is dark or frozen, at a quarter of the cost
-)
+_WATCHED = 2  # every second pixel shows a dark or frozen camera, at a quarter of the cost
 _RATES = 200  # of turns that are kept: those of a second or more
 _AT_ONCE_NS = 1_000_000  # a robot turns by less than a tenth of a column in this time
 _NEAR_NS = 200_000_000  # an older rate of turn says nothing about an image
