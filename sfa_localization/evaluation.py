@@ -144,11 +144,17 @@ def evaluate(
         fitted = drives[: len(align_bags) or 1]
         transform = fit_transform(*((d.true.poses, d.images.poses) for d in fitted))
     corrections = tuple(f'{d.run.name}: {text}' for d in drives for text in d.sentences)
-    if model.surround:
-        knocked = yaws_of(Path(bag), recipe, progress).sentences(KNOCKED_RAD)
-        remedy = 'of what it was in training: mount it as it was, or train again'
-        corrections += tuple(f'{drives[-1].run.name}: {text} {remedy}' for text in knocked)
+    corrections += _knocked(bag, recipe, progress)
     return _judged(drives[-1], localizer.filter, transform, aligned_on, corrections)
+
+
+def _knocked(bag: Path, recipe: Recipe, progress: bool) -> tuple[str, ...]:
+    """Sentences about cameras of a rig that were turned since the training."""
+    if not recipe.surround:
+        return ()
+    texts = yaws_of(bag, recipe, progress).sentences(KNOCKED_RAD)
+    remedy = 'of what it was in training: mount it as it was, or train again'
+    return tuple(f'{bag.name}: {text} {remedy}' for text in texts)
 
 
 def _judged(

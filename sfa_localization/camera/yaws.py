@@ -45,6 +45,7 @@ _YAW_STD = np.radians(3.0)
 _TURN_STD = np.radians(1.0)
 _SHIFT_STD = np.radians(0.5)
 _INVERSE_STD = 0.15
+_NEAREST_INVERSE = 1.0  # things are farther than a meter
 _PASSES = 8
 _CERTAIN_STD = np.radians(0.5)  # else a drive has too few pairs
 _LEAST = np.radians(0.3)  # half a column of the panorama
@@ -183,61 +184,73 @@ class YawComparison:
         start, texture = view
         later_start, later_texture = later
         width = self._panorama.width
-        reach = int(_SEARCHED_DEG / 360 * width)
-        fewest = int(_FEWEST_DEG / 360 * width)
-        base = start + round(expected) - later_start
-        base = (base + width // 2) % width - width // 2
-        scores = np.full(2 * reach + 1, -1.0)
-        for lag in range(-reach, reach + 1):
-            scores[lag + reach] = _correlation(texture, later_texture, base + lag, fewest)
+        offset = start + round(expected) - later_start
+        offset = (offset + width // 2) % width - width // 2
+        lag = self._lag(texture, later_texture, offset)
+        if lag is None:
+            return None
+        low, high = _both(texture, later_texture, offset + round(lag))
+        return lag + round(expected) - expected, (start + (low + high) // 2) % width
+
+    def _lag(self, texture: Texture, later: Texture, offset: int) -> float | None:
+        """By how many columns more than an offset the later texture lies, where both correlate."""
+        reach = int(_SEARCHED_DEG / 360 * self._panorama.width)
+        fewest = int(_FEWEST_DEG / 360 * self._panorama.width)
+        lags = range(-reach, reach + 1)
+        scores = np.array([_correlation(texture, later, offset + lag, fewest) for lag in lags])
         top = int(np.argmax(scores))
         around = scores[max(top - 1, 0) : top + 2]
         if scores[top] < _ALIKE or len(around) < 3 or around.min() < 0:
             return None
-        peak = top + float(parabola_peak(*np.split(around, 3))[0])
-        offset = base + top - reach
-        low = max(0, -offset)
-        high = min(texture.shape[1], later_texture.shape[1] - offset)
-        return peak - reach + round(expected) - expected, (start + (low + high) // 2) % width
+        return top - reach + float(parabola_peak(*np.split(around, 3))[0])
 
     def fit(self, sightings: Sequence[Sighting]) -> Yaws:
         """The errors of all yaws, by sightings: a ridge regression whose weights are those of
         errors with outliers.
         """
         names = [*self._cameras]
-        count = 1 + max((sighting.pair for sighting in sightings), default=-1)
-        size = len(names) + 1 + count
-        design = np.zeros((len(sightings), size))
+        cameras = len(names)
+        design = self._design(sightings)
+        shift = np.array([seen.shift for seen in sightings])
+        variance = _SHIFT_STD**2 + (design[:, cameras] * _INVERSE_STD) ** 2
+        prior = np.full(design.shape[1], _TURN_STD)
+        prior[:cameras] = _YAW_STD
+        prior[cameras] = _NEAREST_INVERSE
+        weight = 1.0 / variance
+        for _ in range(_PASSES):
+            information = design.T @ (design * weight[:, None]) + np.diag(prior**-2)
+            solution = np.linalg.solve(information, design.T @ (weight * shift))
+            residual = shift - design @ solution
+            weight = 1.0 / (variance * outlier_factor(residual**2 / variance))
+        errors = solution[:cameras] - np.median(solution[:cameras])
+        mean = np.eye(cameras) - 1.0 / cameras
+        covariance = np.linalg.inv(information)[:cameras, :cameras]
+        std = np.sqrt(np.diag(mean @ covariance @ mean))
+        return Yaws(dict(zip(names, map(Quantity, errors.tolist(), std.tolist()), strict=True)))
+
+    def _design(self, sightings: Sequence[Sighting]) -> Array:
+        """Derivatives of shifts by yaws, the inverse distance of things, and turns of pairs."""
+        names = [*self._cameras]
+        pair_count = 1 + max((sighting.pair for sighting in sightings), default=-1)
+        design = np.zeros((len(sightings), len(names) + 1 + pair_count))
         for row, seen in enumerate(sightings):
             design[row, names.index(seen.first)] += 1.0
             design[row, names.index(seen.second)] -= 1.0
             design[row, len(names)] = seen.parallax
             design[row, len(names) + 1 + seen.pair] = 1.0
-        shift = np.array([seen.shift for seen in sightings])
-        variance = _SHIFT_STD**2 + (design[:, len(names)] * _INVERSE_STD) ** 2
-        prior = np.full(size, _TURN_STD**-2)
-        prior[: len(names)] = _YAW_STD**-2
-        prior[len(names)] = 1.0  # things are farther than a meter
-        weight = 1.0 / variance
-        for _ in range(_PASSES):
-            information = design.T @ (design * weight[:, None]) + np.diag(prior)
-            solution = np.linalg.solve(information, design.T @ (weight * shift))
-            residual = shift - design @ solution
-            weight = 1.0 / (variance * outlier_factor(residual**2 / variance))
-        covariance = np.linalg.inv(information)[: len(names), : len(names)]
-        errors = solution[: len(names)] - np.median(solution[: len(names)])
-        mean = np.eye(len(names)) - 1.0 / len(names)
-        std = np.sqrt(np.diag(mean @ covariance @ mean))
-        quantities = map(Quantity, errors.tolist(), std.tolist())
-        return Yaws(dict(zip(names, quantities, strict=True)))
+        return design
+
+
+def _both(one: Texture, other: Texture, offset: int) -> tuple[int, int]:
+    """The columns of a texture, from and up to, that another, `offset` columns further, has too."""
+    return max(0, -offset), min(one.shape[1], other.shape[1] - offset)
 
 
 def _correlation(one: Texture, other: Texture, offset: int, fewest: int) -> float:
     """Correlation of a texture (rows, N) with the columns of another that lie `offset` columns
     further; -1 for fewer columns than `fewest`.
     """
-    low = max(0, -offset)
-    high = min(one.shape[1], other.shape[1] - offset)
+    low, high = _both(one, other, offset)
     if high - low < fewest:
         return -1.0
     a = one[:, low:high]
