@@ -5,25 +5,20 @@
 from __future__ import annotations
 
 import numpy as np
-from rosbags.typesys import Stores
 
-from sfa_localization.bags.decoding import typestore
-from sfa_localization.bags.writer import BagWriter, blank
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.lenses import turned_camera
-from sfa_localization.camera.sectors import MountedCamera
+from sfa_localization.camera.sectors import MountedCamera, optical_pose
 from sfa_localization.camera.settings import LensCalibration
-from sfa_localization.data.sphere import rotation
+from sfa_localization.data.sphere import directions, rotation
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
-STORE = typestore(Stores.ROS2_JAZZY)
-FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Columns: the axes of an optical frame (right, down, ahead) of a camera that looks forward."""
 
 
 def pinhole(fov=100.0, width=200, height=120):
     """A pinhole camera with this horizontal field of view, degrees."""
-    focal = width / 2 / np.tan(np.radians(fov / 2))
+    focal = float(width / 2 / np.tan(np.radians(fov / 2)))
     return LensCalibration(
         camera_model='mirror', image_width=width, image_height=height, fx=focal, fy=focal,
         cx=width / 2 - 0.5, cy=height / 2 - 0.5, xi=0.0, radius_min=0.0, radius_max=0.0,
@@ -33,7 +28,7 @@ def pinhole(fov=100.0, width=200, height=120):
 
 def fisheye(fov=190.0, size=200):
     """An equidistant fisheye, whose circle touches the edges of a square image."""
-    focal = size / 2 / np.radians(fov / 2)
+    focal = float(size / 2 / np.radians(fov / 2))
     return LensCalibration(
         camera_model='fisheye', image_width=size, image_height=size, fx=focal, fy=focal,
         cx=size / 2 - 0.5, cy=size / 2 - 0.5, radius_min=0.0, radius_max=size / 2,
@@ -42,10 +37,8 @@ def fisheye(fov=190.0, size=200):
 
 def camera(name, yaw_deg, lens=None, radius=0.2):
     """A camera at a radius, m, from the center of the robot, which looks away from it."""
-    turn = rotation(0.0, 0.0, np.radians(yaw_deg))
-    pose = np.eye(4)
-    pose[:3, :3] = turn @ FORWARD
-    pose[:3, 3] = turn @ [radius, 0.0, 0.0]
+    ahead, left, _ = radius * directions(np.radians(yaw_deg), 0.0)
+    pose = optical_pose((ahead, left, 0.0), (0.0, 0.0, yaw_deg))
     return MountedCamera.at(name, lens or pinhole(), pose)
 
 
@@ -81,50 +74,6 @@ def speckled(rays):
     return np.repeat(level[:, None], 3, axis=1)
 
 
-def camera_info(mounted, stamp_ns):
-    """The sensor_msgs/CameraInfo of a pinhole camera or a fisheye."""
-    lens = mounted.lens
-    info = blank(STORE, 'sensor_msgs/msg/CameraInfo')
-    stamped(info, stamp_ns, f'{mounted.name}_optical')
-    info.width = lens.image_width
-    info.height = lens.image_height
-    info.distortion_model = 'equidistant' if lens.camera_model == 'fisheye' else 'plumb_bob'
-    info.d = np.zeros(4 if lens.camera_model == 'fisheye' else 5)
-    info.k = np.array([lens.fx, 0, lens.cx, 0, lens.fy, lens.cy, 0, 0, 1.0])
-    return info
-
-
-def stamped(message, stamp_ns, frame):
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(int(stamp_ns), SECOND)
-    message.header.frame_id = frame
-
-
-def transforms(cameras):
-    """The message of /tf_static with the optical frames of cameras on base_link."""
-    message = blank(STORE, 'tf2_msgs/msg/TFMessage')
-    for mounted in cameras:
-        part = blank(STORE, 'geometry_msgs/msg/TransformStamped')
-        stamped(part, START, 'base_link')
-        part.child_frame_id = f'{mounted.name}_optical'
-        moved = part.transform.translation
-        moved.x, moved.y, moved.z = mounted.place
-        turned = part.transform.rotation
-        turned.x, turned.y, turned.z, turned.w = quaternion(np.array(mounted.rotation))
-        message.transforms.append(part)
-    return message
-
-
-def quaternion(m):
-    """x, y, z, w of a rotation (3, 3)."""
-    axis = np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
-    # The eigenvector of the largest eigenvalue also holds for half a turn.
-    square = np.zeros((4, 4))
-    square[:3, :3] = m + m.T - np.trace(m) * np.eye(3)
-    square[:3, 3] = square[3, :3] = axis
-    square[3, 3] = np.trace(m)
-    return np.linalg.eigh(square)[1][:, -1].tolist()
-
-
 def write_bag(
     path,
     cameras,
@@ -148,7 +97,8 @@ def write_bag(
     rates = np.gradient(headings, period_s) if len(headings) > 1 else np.zeros(1)
     with BagWriter(path) as bag:
         if with_tf:
-            bag.message('/tf_static', START, transforms(stated or cameras))
+            frames = {f'{mounted.name}_optical': mounted for mounted in stated or cameras}
+            bag.static_transforms(START, 'base_link', frames)
         for number, stamp in enumerate(stamps.tolist()):
             for part in range(4):
                 at = stamp + part * step // 4
@@ -164,8 +114,8 @@ def write_bag(
                 image = picture(mounted, scene, heading)
                 bag.image(f'/{mounted.name}/image_raw', at, image, f'{mounted.name}_optical')
                 if with_info:
-                    info = camera_info(mounted, at)
-                    bag.message(f'/{mounted.name}/camera_info', at, info)
+                    info = f'/{mounted.name}/camera_info'
+                    bag.camera_info(info, at, mounted.lens, f'{mounted.name}_optical')
         last = np.array([0.0, 0.0, headings[-1]])
         bag.odometry('/odom', int(stamps[-1]) + step, last, np.zeros(2), np.zeros(2))
     return path

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from sfa_localization.bags.decoding import decode
 from sfa_localization.bags.reader import Bag
 from sfa_localization.camera.calibration_files import calibration_of_info
-from sfa_localization.camera.lenses import make_camera
+from sfa_localization.camera.lenses import make_camera, turned_camera
 from sfa_localization.camera.leveling import tilted
 from sfa_localization.camera.panorama import Unwrapper, panorama_rays
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
@@ -256,15 +256,10 @@ def qos_is_latched(topic):
 
 def seen_by(image, lens, turn, rays):
     """What an image shows along rays (N, 3) in the robot's axes: colors (N, 3), NaN elsewhere."""
-    plain = replace(lens, axis='forward', mirrored='no')
-    camera = make_camera(plain, image.shape[:2])
-    pixels = camera.project(rays @ turn @ OPTICAL.T)
+    pixels = turned_camera(lens, image.shape[:2], turn).project(rays)
     seen = np.isfinite(pixels[:, 0])
     columns, rows = np.rint(np.where(seen[:, None], pixels, 0)).astype(int).T
     return np.where(seen[:, None], image[rows, columns].astype(float), np.nan)
-
-
-OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 @pytest.mark.parametrize(

@@ -7,16 +7,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs import camera, fisheye, picture, pinhole, smooth
 from scipy.spatial.transform import Rotation
 
 from sfa_localization.camera import surround
 from sfa_localization.camera.calibration_files import calibration_text
-from sfa_localization.camera.lenses import turned_camera
 from sfa_localization.camera.panorama import panorama_rays
-from sfa_localization.camera.sectors import MountedCamera, optical_pose
-from sfa_localization.camera.settings import LensCalibration, PanoramaConfig, SurroundConfig
+from sfa_localization.camera.sectors import optical_pose
+from sfa_localization.camera.settings import PanoramaConfig, SurroundConfig
 from sfa_localization.config import load_settings
 from sfa_localization.data.errors import ConfigError
+from sfa_localization.data.sphere import rotation
 
 pytest.importorskip('rclpy')
 
@@ -43,37 +44,6 @@ START_NS, STEP_NS = 12_000_000_000, 100_000_000
 YAWS = {'front': 0.0, 'left': 90.0, 'rear': 180.0, 'right': 270.0}
 
 
-def color(rays, turn=0.0):
-    """The color (..., 3) along rays (..., 3): it differs by direction, and by channel."""
-    azimuth = np.arctan2(rays[..., 1], rays[..., 0]) + turn
-    waves = np.sin(azimuth), np.cos(azimuth), np.sin(2 * azimuth) + 2 * rays[..., 2]
-    return 128 + 40 * np.stack(waves, axis=-1)
-
-
-def pinhole(width=160, height=120, fov_deg=100.0):
-    focal = float(width / 2 / np.tan(np.radians(fov_deg / 2)))
-    return LensCalibration(
-        image_width=width, image_height=height, fx=focal, fy=focal, cx=width / 2 - 0.5,
-        cy=height / 2 - 0.5, xi=0.0, radius_min=0.0, radius_max=0.0, axis='forward', mirrored='no',
-    )  # fmt: skip
-
-
-def fisheye(width=160, height=160, fov_deg=190.0):
-    focal = float(width / np.radians(fov_deg))
-    lens = pinhole(width, height)
-    return replace(lens, camera_model='fisheye', fx=focal, fy=focal)
-
-
-def picture(lens, yaw_deg, turn=0.0):
-    """What a camera sees that looks toward an azimuth of the robot, turned by an angle."""
-    size = lens.image_height, lens.image_width
-    model = turned_camera(lens, size, optical_pose((0, 0, 0), (0, 0, yaw_deg))[:3, :3])
-    columns, rows = np.meshgrid(np.arange(size[1]), np.arange(size[0]))
-    rays = model.unproject(np.stack([columns.ravel(), rows.ravel()], -1).astype(float))
-    seen = np.nan_to_num(color(rays, turn)).clip(0, 255)
-    return np.rint(seen).astype(np.uint8).reshape(*size, 3)
-
-
 def info_of(lens):
     is_fisheye = lens.camera_model == 'fisheye'
     k = [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0]
@@ -93,6 +63,7 @@ class Rig:
     def __init__(self, bench, yaws=None, lens=None, node=None, step_rad=0.01, **parameters):
         self.bench, self.yaws = bench, yaws or YAWS
         self.lens, self.step_rad = lens or pinhole(), step_rad
+        self.cameras = {name: camera(name, yaw, lens, 0.0) for name, yaw in self.yaws.items()}
         self.number, self.skew_ns = 0, dict.fromkeys(self.yaws, 0)
         given = {'cameras': [*self.yaws], 'camera_poses': poses(self.yaws.values())}
         given = {name: value for name, value in (SMALL | given | parameters).items() if value}
@@ -111,11 +82,11 @@ class Rig:
         """The images of the next time, of all cameras but some; waits until each is taken."""
         self.number += 1
         stamp_ns = START_NS + self.number * STEP_NS
-        for name, yaw in self.yaws.items():
+        for name in self.yaws:
             if name in without:
                 continue
             taken_ns = stamp_ns + self.skew_ns[name]
-            image = picture(self.lens, yaw, self.turn_at(taken_ns))
+            image = picture(self.cameras[name], heading=self.turn_at(taken_ns))
             image = make(name, image) if make else image
             sent = to_image(image, taken_ns, f'{name}_optical_frame')
             monitor = self.node.monitors[f'{name}/image_raw']
@@ -147,9 +118,14 @@ def pixels(message):
     return np.frombuffer(message.data, np.uint8).reshape(message.height, message.width, 3)
 
 
-def closeness(panorama, turn):
+def scene(rays, turn):
+    """What the cameras see along rays (H, W, 3) of a robot that is turned, (H, W, 3)."""
+    return smooth(rays.reshape(-1, 3) @ rotation(0.0, 0.0, turn).T).reshape(rays.shape)
+
+
+def closeness(panorama, turn, config=PANORAMA):
     """The mean difference, gray levels, between a panorama and what the cameras look at."""
-    return np.abs(panorama - color(panorama_rays(PANORAMA), turn)).mean()
+    return np.abs(panorama - scene(panorama_rays(config), turn)).mean()
 
 
 @pytest.mark.parametrize(('yaws', 'lens'), [
@@ -274,7 +250,7 @@ def test_a_faulty_camera_is_hidden_and_named_until_it_is_back(bench, trouble, re
     rig.describe()
     rig.next()
     filter_node = bench.run(EkfNode)
-    still = picture(rig.lens, 180.0)
+    still = picture(rig.cameras['rear'])
 
     def faulty(name, image):
         if name != 'rear' or trouble == 'gone':
@@ -326,7 +302,7 @@ def test_an_image_of_another_camera_is_refused_and_the_others_go_on(bench):
     for _ in range(8):
         rig.send(make=lambda name, image: image[:50] if name == 'left' else image)
     (reason,) = rig.node.monitors['left/image_raw'].refused
-    assert reason.startswith('the image is 160 x 50 but the camera is calibrated for 160 x 120')
+    assert reason.startswith('the image is 200 x 50 but the camera is calibrated for 200 x 120')
     assert until(lambda: len(rig.heard) >= count + 4)
     assert rig.health()[1] == 'camera left: it sends no images'
 
@@ -337,7 +313,7 @@ def test_images_are_compressed_where_only_these_are_published(bench, monkeypatch
     yaws = {'front': 0.0, 'rear': 180.0}
     node = bench.run(OmnicamNode, cameras=[*yaws], camera_poses=poses(yaws.values()), **SMALL)
     bench.listen(Image, 'panorama')
-    sent = to_compressed(picture(fisheye(), 0.0), START_NS, 'x', 90)
+    sent = to_compressed(picture(camera('front', 0.0, fisheye())), START_NS, 'x', 90)
     monitor = node.monitors['front/image_raw']
     assert bench.publish_until('/front/image_raw/compressed', sent, lambda: monitor.received)
     assert node.full_name('front/image_raw') == '/front/image_raw/compressed'
@@ -371,17 +347,13 @@ def test_sectors_are_hidden_while_it_runs(bench):
 
 def test_cameras_of_the_model_are_used(bench, trained, tmp_path):
     """Their names may be left out, and others are refused."""
-    mounted = tuple(
-        MountedCamera.at(name, pinhole(), optical_pose((0.0, 0.0, 0.5), (0.0, 0.0, yaw)))
-        for name, yaw in YAWS.items()
-    )
+    mounted = tuple(camera(name, yaw, radius=0.0) for name, yaw in YAWS.items())
     model, path = PlaceModel.load(trained.model), tmp_path / 'model.npz'
     replace(model, surround=mounted).save(path)
     node = bench.run(OmnicamNode, model=str(path))
     rig = Rig(bench, node=node)
     panorama, stamp_ns, _ = rig.next()
-    rays = panorama_rays(model.panorama)
-    assert np.abs(panorama - color(rays, rig.turn_at(stamp_ns))).mean() < 3
+    assert closeness(panorama, rig.turn_at(stamp_ns), model.panorama) < 3
     other = bench.run(OmnicamNode, False, model=str(path), cameras=['front', 'back'])
     assert not other.start()
     assert other.failure == (
