@@ -317,7 +317,8 @@ def test_images_are_compressed_where_only_these_are_published(bench, monkeypatch
     monitor = node.monitors['front/image_raw']
     assert bench.publish_until('/front/image_raw/compressed', sent, lambda: monitor.received)
     assert node.full_name('front/image_raw') == '/front/image_raw/compressed'
-    node.around.look()
+    for search in node.around._searches:
+        search.look()
     assert node.full_name('rear/image_raw') == '/rear/image_raw'
 
 

@@ -145,7 +145,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
             partial(self._new_surround, self._settings),
             self._publish_joined,
         )
-        self._input = self.around.topics[self.around.names[0]]
+        self._input = next(iter(self.around.topics.values()))
 
     def _new_surround(self, settings: Current, cameras: Sequence[MountedCamera]) -> Surround:
         """What makes panoramas of cameras. Raises CameraError."""

@@ -8,7 +8,7 @@ files or camera_info, and places from parameters or /tf_static.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,69 @@ _STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Of /tf_static, which has a latched message of each of its publishers."""
 
 
+class Descriptions:
+    """Lenses and places of cameras by parameters, or by camera_info beside their images and
+    /tf_static.
+    """
+
+    def __init__(self, node: LocalizationNode, topics: Mapping[str, str], config: SurroundConfig):
+        self._node = node
+        self._topics = topics
+        self._lenses = dict(zip(topics, map(_read, config.camera_files), strict=False))
+        self._poses = dict(zip(topics, _poses(config.camera_poses), strict=False))
+        self._tree = TransformTree()
+        self._subscriptions: list[Any] = []
+
+    def start(self) -> None:
+        """Subscribe to what is not known."""
+        for name in self._topics.keys() - self._lenses.keys():
+            images = without_transport(self._node.full_name(self._topics[name]))
+            info = f'{name}/camera_info'
+            beside = f'{images.rpartition("/")[0]}/camera_info'
+            topic = info if self._node.is_remapped(info) else beside
+            take = partial(self._take_info, name)
+            described = self._node.subscribe(CameraInfo, info, take, sensor_qos(1), topic)
+            self._subscriptions.append(described)
+        if TFMessage is not None and self._topics.keys() - self._poses.keys():
+            transforms = self._node.subscribe(TFMessage, TOPIC, self._tree.add, _STATIC)
+            self._subscriptions.append(transforms)
+
+    def stop(self) -> None:
+        """End the subscriptions."""
+        for subscription in self._subscriptions:
+            self._node.unsubscribe(subscription)
+        self._subscriptions.clear()
+
+    def _take_info(self, name: str, message: CameraInfo) -> None:
+        self._lenses[name] = calibration_of_info(message)
+
+    def place(self, name: str, frame: str, base: str) -> None:
+        """Look where the frame of a camera's images sits on the robot's frame."""
+        if name not in self._poses:
+            pose = self._tree.pose(frame, base)
+            pose = self._tree.pose(frame, _BASE) if pose is None else pose
+            if pose is not None:
+                self._poses[name] = pose
+
+    @property
+    def missing(self) -> str:
+        """What is not known of the cameras yet, with what to do; '' if all is."""
+        lenses = ', '.join(name for name in self._topics if name not in self._lenses)
+        poses = ', '.join(name for name in self._topics if name not in self._poses)
+        parts = [f'no camera_info of {lenses}: publish it, or set camera_files'] if lenses else []
+        if poses:
+            parts.append(
+                f'no pose of {poses} on /tf_static from {_BASE}: publish it, or set camera_poses'
+            )
+        return '; '.join(parts)
+
+    def cameras(self) -> list[MountedCamera]:
+        """The cameras, of which nothing is missing."""
+        return [
+            MountedCamera.at(name, self._lenses[name], self._poses[name]) for name in self._topics
+        ]
+
+
 class SurroundInput:
     """Calls `use` with stamp, ns, and panorama (H, W, 3) of the images of several cameras.
 
@@ -62,40 +125,28 @@ class SurroundInput:
         self._node = node
         self._make = make
         self._use = use
-        self.names = config.cameras or tuple(camera.name for camera in trained)
-        require_rig(self.names)
-        if trained and set(self.names) != {camera.name for camera in trained}:
-            listed = ', '.join(camera.name for camera in trained)
-            raise ConfigError(f'cameras: the model was trained on {listed}; name these, or none')
-        self._lenses = dict[str, LensCalibration]()
-        self._poses = dict[str, Array]()
-        if not trained:
-            self._lenses |= zip(self.names, map(_read, config.camera_files), strict=False)
-            self._poses |= zip(self.names, _poses(config.camera_poses), strict=False)
-        self._frames = dict[str, str]()
         self._base = _BASE
-        self._tree = TransformTree()
-        self.surround = make(trained) if trained else None
-        self._described: list[Any] = []
         self._odometry: Any = None
-        self._substitute_odometry = ''
+        self._odometry_topic = ''
         self._listens = False
-        raw = transport == 'raw'
-        self.topics = dict[str, str]()
-        self._inputs = dict[str, ImageInput]()
-        self._substitutes = dict.fromkeys(self.names, ('', ''))
-        self._searches = dict[str, Discovery]()
-        for name in self.names:
-            base = f'{name}/image_raw'
-            topic = base if raw else node.following(f'{base}/{transport}')
-            node.require_input(topic)
-            self.topics[name] = topic
-            self._inputs[name] = ImageInput(node, transport, topic, partial(self._take, name))
-            types = self._inputs[name].types
-            take = partial(self._substitute, name)
-            self._searches[name] = Discovery(node, topic, types, [base], take, fixed=True)
-        odometry = ['nav_msgs/msg/Odometry']
-        Discovery(node, _ODOM, odometry, [_ODOM], self._take_odometry_of)
+        self.surround = make(trained) if trained else None
+        names = _names(config, trained)
+        self.topics = {name: _image_topic(node, name, transport) for name in names}
+        self._descriptions = Descriptions(node, self.topics, config)
+        self._substitutes = dict.fromkeys(names, ('', ''))
+        self._inputs = {
+            name: ImageInput(node, transport, topic, partial(self._take, name))
+            for name, topic in self.topics.items()
+        }
+        self._searches = [self._search(name) for name in names]
+        Discovery(node, _ODOM, ['nav_msgs/msg/Odometry'], [_ODOM], self._take_odometry_of)
+
+    def _search(self, name: str) -> Discovery:
+        """The search for another transport of a camera's images."""
+        types = self._inputs[name].types
+        given = [f'{name}/image_raw']
+        take = partial(self._substitute, name)
+        return Discovery(self._node, self.topics[name], types, given, take, fixed=True)
 
     # Subscriptions, while somebody listens.
 
@@ -105,7 +156,7 @@ class SurroundInput:
         for name, images in self._inputs.items():
             images.start(*self._substitutes[name])
         if self.surround is None:
-            self._listen_to_descriptions()
+            self._descriptions.start()
         self._follow_odometry()
 
     def stop(self) -> None:
@@ -114,7 +165,7 @@ class SurroundInput:
         for images in self._inputs.values():
             images.stop()
         self._follow_odometry()
-        self._end_descriptions()
+        self._descriptions.stop()
 
     def _substitute(self, name: str, topic: str, kind: str) -> None:
         """Take a camera's images by another transport."""
@@ -126,7 +177,7 @@ class SurroundInput:
 
     def _take_odometry_of(self, topic: str, _: str) -> None:
         """Take odometry from a substitute for its topic."""
-        self._substitute_odometry = topic
+        self._odometry_topic = topic
         self._node.require_input(_ODOM, topic)
         self._node.unsubscribe(self._odometry)
         self._odometry = None
@@ -136,37 +187,13 @@ class SurroundInput:
         """Subscribe to the odometry while it is of use: its messages are the most frequent ones."""
         is_of_use = self._listens and (self.surround is None or self.surround.is_skewed)
         if is_of_use and self._odometry is None:
-            qos = sensor_qos(20)
-            topic = self._substitute_odometry
-            take = self._take_turn
-            self._odometry = self._node.subscribe(Odometry, _ODOM, take, qos, topic)
+            given = self._take_turn, sensor_qos(20), self._odometry_topic
+            self._odometry = self._node.subscribe(Odometry, _ODOM, *given)
         elif not is_of_use:
             self._node.unsubscribe(self._odometry)
             self._odometry = None
 
-    def _listen_to_descriptions(self) -> None:
-        """Subscribe to camera_info beside the images, and to /tf_static."""
-        for name in set(self.names) - set(self._lenses):
-            images = without_transport(self._node.full_name(self.topics[name]))
-            info = f'{name}/camera_info'
-            beside = f'{images.rpartition("/")[0]}/camera_info'
-            topic = info if self._node.is_remapped(info) else beside
-            take = partial(self._take_info, name)
-            qos = sensor_qos(1)
-            self._described.append(self._node.subscribe(CameraInfo, info, take, qos, topic))
-        if TFMessage is not None and set(self.names) - set(self._poses):
-            transforms = self._node.subscribe(TFMessage, TOPIC, self._tree.add, _STATIC)
-            self._described.append(transforms)
-
-    def _end_descriptions(self) -> None:
-        for subscription in self._described:
-            self._node.unsubscribe(subscription)
-        self._described.clear()
-
     # Messages.
-
-    def _take_info(self, name: str, message: CameraInfo) -> None:
-        self._lenses[name] = calibration_of_info(message)
 
     def _take_turn(self, message: Odometry) -> None:
         _, (_, omega, *_) = read_odometry(message)
@@ -176,51 +203,20 @@ class SurroundInput:
 
     def _take(self, name: str, stamp_ns: int, image: Image, frame: str) -> None:
         """Use an image. Raises MessageError before all cameras are described, and CameraError."""
-        self._frames[name] = frame
         if self.surround is None:
-            self._describe()
-        if self.surround is None:
-            raise MessageError(self.missing())
+            self._descriptions.place(name, frame, self._base)
+            if missing := self._descriptions.missing:
+                raise MessageError(missing)
+            self.surround = self._make(self._descriptions.cameras())
+            self._descriptions.stop()
         for panorama_ns, panorama in self.surround.add(name, stamp_ns, image):
             self._use(panorama_ns, panorama)
             self._follow_odometry()
-
-    def _describe(self) -> None:
-        """Begin with panoramas, if all cameras are described. Raises CameraError."""
-        for name in set(self._frames) - set(self._poses):
-            for base in dict.fromkeys((self._base, _BASE)):
-                pose = self._tree.pose(self._frames[name], base)
-                if pose is not None:
-                    self._poses.setdefault(name, pose)
-        if not self.missing():
-            cameras = [MountedCamera.at(n, self._lenses[n], self._poses[n]) for n in self.names]
-            self.surround = self._make(cameras)
-            self._end_descriptions()
-
-    def missing(self) -> str:
-        """What is not known of the cameras yet, with what to do; '' if all is."""
-        if self.surround is not None:
-            return ''
-        without_lens = [name for name in self.names if name not in self._lenses]
-        without_pose = [name for name in self.names if name not in self._poses]
-        parts = []
-        if without_lens:
-            parts.append(f'no camera_info of {", ".join(without_lens)}: publish it, or set '
-                         'camera_files')  # fmt: skip
-        if without_pose:
-            parts.append(f'no pose of {", ".join(without_pose)} on /tf_static from {self._base}: '
-                         'publish it, or set camera_poses')  # fmt: skip
-        return '; '.join(parts)
 
     def remake(self) -> None:
         """Begin anew with the same cameras after a change of parameters. Raises CameraError."""
         if self.surround is not None:
             self.surround = self._make(self.surround.cameras)
-
-    def look(self) -> None:
-        """Look for other transports of the images that nobody publishes."""
-        for search in self._searches.values():
-            search.look()
 
     # State.
 
@@ -233,18 +229,36 @@ class SurroundInput:
         silent = [self._node.monitors[topic].silent_for_s() for topic in self.topics.values()]
         if min(*silent, listening_s) > patience_s:
             names = ', '.join(map(self._node.full_name, self.topics.values()))
-            hints = [search.hint for search in self._searches.values() if search.hint]
+            hints = [search.hint for search in self._searches if search.hint]
             return ERROR, '; '.join(hints) or f'no image on {names}'
         if self.surround is None:
-            return ERROR if listening_s > patience_s else WARN, self.missing()
+            return ERROR if listening_s > patience_s else WARN, self._descriptions.missing
         troubles = self.surround.troubles
-        for name in self.names:
+        for name in self.topics:
             details[f'camera {name}'] = troubles[name].reason if name in troubles else 'used'
         visible = self.surround.visible
         if visible is not None:
             details['panorama visible [%]'] = f'{100 * visible.mean():.0f}'
         text = '; '.join(f'camera {name}: {reason}' for name, (reason, _) in troubles.items())
         return (WARN, text) if troubles else (OK, '')
+
+
+def _names(config: SurroundConfig, trained: Sequence[MountedCamera]) -> tuple[str, ...]:
+    """The names of the cameras. Raises ConfigError for others than those of a model."""
+    names = config.cameras or tuple(camera.name for camera in trained)
+    require_rig(names)
+    if trained and {*names} != {camera.name for camera in trained}:
+        listed = ', '.join(camera.name for camera in trained)
+        raise ConfigError(f'cameras: the model was trained on {listed}; name these, or none')
+    return names
+
+
+def _image_topic(node: LocalizationNode, name: str, transport: str) -> str:
+    """The topic of a camera's images. Raises ConfigError for one that the node publishes."""
+    base = f'{name}/image_raw'
+    topic = base if transport == 'raw' else node.following(f'{base}/{transport}')
+    node.require_input(topic)
+    return topic
 
 
 def _poses(numbers: Sequence[float]) -> list[Array]:
