@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.camera.leveling import leveled
-from sfa_localization.camera.panorama import filled
+from sfa_localization.camera.panorama import filled, repeated_columns
 from sfa_localization.camera.sectors import MountedCamera
 from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.array_files import Arrays, read_arrays, read_header, write_arrays
@@ -122,16 +122,26 @@ class PlaceModel:
     def views(self, panoramas: Image) -> list[View]:
         """Textures of panoramas (T, H, W, 3), leveled by keyframes."""
         require_size(panoramas, self.network.architecture)
-        level = [upright(self.keyframes, image) for image in panoramas]
+        level = [upright(self._comparable(image), image) for image in panoramas]
         maps = self.network.maps(np.stack([image.panorama for image in level]))
         spectra = spectrum(maps[min(TURNED_LAYER, len(maps) - 1)])
         return list(map(View, level, slow_features(maps), spectra))
 
     def located(self, view: View, conditions: Conditions) -> Location:
         """Where the camera was, by keyframes and slow features in the current conditions."""
-        fits, tilt = hypotheses(self.keyframes, view.upright, conditions.pattern)
+        keyframes = self._comparable(view.upright.seen)
+        fits, tilt = hypotheses(keyframes, view.upright, conditions.pattern)
         slow = self._slow_places(view, fits)
         return located(fits, slow, conditions.scales, self.keyframes.errors, tilt)
+
+    def _comparable(self, panorama: Image) -> Keyframes:
+        """The keyframes, compared only where the panorama (H, W, 3) of several cameras shows more
+        than repeated columns: where a camera is missing.
+        """
+        hidden = repeated_columns(panorama) if self.surround else np.zeros(1, bool)
+        if not hidden.any() or hidden.all():
+            return self.keyframes
+        return self.keyframes.seeing(np.broadcast_to(~hidden, panorama.shape[:2]))
 
     def _slow_places(self, view: View, fits: Sequence[Fit]) -> tuple[Array, Array]:
         """Where the map puts an image at the heading of each of H hypotheses, (H, 2) m, and its

@@ -10,7 +10,7 @@ import json
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from rigs import camera, fisheye, picture, pinhole, rig, smooth
+from rigs import camera, fisheye, picture, pinhole, rig, smooth, speckled
 
 from sfa_localization.camera.joining import LATE, NO_IMAGE, StampJoiner
 from sfa_localization.camera.panorama import panorama_rays
@@ -18,6 +18,7 @@ from sfa_localization.camera.sectors import MountedCamera, SurroundView, visible
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.surround import Surround, sentence
 from sfa_localization.camera.watch import FROZEN_IMAGES
+from sfa_localization.camera.yaws import turned
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.rejections import short_line
 
@@ -334,3 +335,28 @@ def test_a_night_hides_no_camera():
 
 def test_texts_fit_into_a_line_of_diagnostics():
     assert short_line(LATE) == LATE and short_line(NO_IMAGE) == NO_IMAGE
+
+
+def test_unused_images_are_counted_by_reason():
+    surround, _ = faulty('black', 8)
+    assert dict(surround.unused['rear']) == {'image is dark': 5}
+    assert not surround.unused['front']
+
+
+def test_a_camera_that_was_turned_since_training_is_named_while_the_robot_turns():
+    """The left one by 10 degrees to the left; poses come before and after each image."""
+    stated = rig()
+    true = [stated[0], turned(stated[1], np.radians(10)), *stated[2:]]
+    surround = Surround(stated, PANORAMA)
+    for number in range(24):
+        heading = 0.5 * number
+        at = 10 * STEP + number * 6 * STEP
+        for part in (-1, 0):
+            surround.add_pose(at + part * STEP, np.array([0.0, 0.0, heading + 0.1 * part]))
+        images = {c.name: picture(c, speckled, heading) for c in true}
+        for name, image in images.items():
+            surround.add(name, at, image)
+        surround._yaws.finish()
+    (sentence_of_left,) = surround.knocked
+    assert sentence_of_left.startswith('camera left looks 10.')
+    assert sentence_of_left.endswith('to the left')

@@ -239,6 +239,9 @@ class _OneCamera:
     def follow(self, odometry: Stream) -> None:
         """Take no part in the odometry."""
 
+    def unused(self, streams: Mapping[str, Stream]) -> None:
+        """Count nothing more than its stream does."""
+
     @property
     def seen(self) -> Mask | None:
         """The pixels (H, W) that the camera sees, if any are hidden."""
@@ -288,6 +291,14 @@ class _SeveralCameras:
         if twist is not None:
             self._surround.add_turn_rate(item.stamp_ns, float(twist[1]))
         return [(odometry, item.stamp_ns, item.value)]
+
+    def unused(self, streams: Mapping[str, Stream]) -> None:
+        """Count the images of cameras that no panorama shows."""
+        for name, reasons in self._surround.unused.items():
+            if stream := streams.get(f'images of {name}'):
+                stream.used -= sum(reasons.values())
+                for reason, number in reasons.items():
+                    stream.skipped.add(reason, number)
 
     @property
     def seen(self) -> Mask | None:
@@ -383,6 +394,7 @@ def _collect(bag: Bag, streams: dict[str, Stream], stored: _PanoramaFile, progre
 
         images.keep = keep
         bag.collect(stream for stream in streams.values() if stream.topic in bag.topics)
+    stored.images.unused(streams)
     if text := frozen(stored.repeats, stored.repeats + len(images.values)):
         raise BagError(f'{bag.path}: {images.topic}: {text}')
 

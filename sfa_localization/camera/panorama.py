@@ -25,6 +25,7 @@ from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.run import Image
 
 _ASPECT = 3.5  # an image wider than this times its height is a panorama
+_SAME_LEVELS = 2  # of gray, between repeated columns in a JPEG
 _ANY_PANORAMA = 1, 4  # rows, columns
 
 
@@ -248,6 +249,14 @@ def repeated_pixels(visible: Mask) -> Indices:
     """The visible pixel, row by row, that each pixel of `visible` (H, W) repeats."""
     rows, columns = nearest_visible(visible)
     return np.asarray(rows * visible.shape[1] + columns)
+
+
+def repeated_columns(panorama: Image) -> NDArray[np.bool_]:
+    """Which columns (W,) of a panorama (H, W, 3) repeat one beside them, as hidden ones do, also
+    after it was compressed.
+    """
+    after = cv2.absdiff(panorama, np.roll(panorama, -1, axis=1)).max(axis=(0, 2)) <= _SAME_LEVELS
+    return np.asarray(after | np.roll(after, 1))
 
 
 def nearest_visible(visible: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -16,9 +16,11 @@ from sfa_localization.camera.joining import Joined, StampJoiner
 from sfa_localization.camera.sectors import MountedCamera, Overlap, Part, SurroundView, View
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.watch import ImageWatch
+from sfa_localization.camera.yaw_watch import YawWatch
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.geometry import Array, Mask
-from sfa_localization.data.run import Image
+from sfa_localization.data.rejections import RejectionCounter
+from sfa_localization.data.run import Image, Trajectory
 
 FEWEST_CAMERAS = 2
 MOST_CAMERAS = 8
@@ -27,6 +29,7 @@ BRIDGED_S = 3.0
 _WATCHED = 2  # every second pixel shows a dark or frozen camera, at a quarter of the cost
 _RATES = 200  # of turns that are kept: those of a second or more
 _AT_ONCE_NS = 1_000_000  # a robot turns by less than a tenth of a column in this time
+_SAME_POSE_NS = 100_000_000  # between the last pose and images whose pose it tells
 _NEAR_NS = 200_000_000  # an older rate of turn says nothing about an image
 
 
@@ -63,9 +66,13 @@ class Surround:
         self._watches = {name: ImageWatch() for name in names}
         self._exposures = Exposures(names)
         self._turns = TurnRates()
+        self._yaws = YawWatch(cameras, panorama)
+        self._poses: deque[tuple[int, Array]] = deque(maxlen=_RATES)
         self._shown: View | None = None
         self._stamp_ns = 0
         self._uses: Counter[frozenset[str]] = Counter()
+        self.unused: dict[str, RejectionCounter] = {name: RejectionCounter() for name in names}
+        """How many images of each camera were not used, by reason."""
 
     @property
     def panorama(self) -> PanoramaConfig:
@@ -109,6 +116,19 @@ class Surround:
         """Take the rate of turn of the robot, rad/s, by odometry or gyroscope."""
         self._turns.add(stamp_ns, omega)
 
+    def add_pose(self, stamp_ns: int, pose: Array) -> None:
+        """Take the pose (3,) of base_link by odometry: with it, cameras that were turned since the
+        training are named in `knocked`.
+        """
+        if self._poses and stamp_ns <= self._poses[-1][0]:
+            self._poses.clear()
+        self._poses.append((stamp_ns, pose))
+
+    @property
+    def knocked(self) -> list[str]:
+        """Sentences about cameras that look elsewhere than their poses say."""
+        return self._yaws.sentences
+
     def add(self, name: str, stamp_ns: int, image: Image) -> list[tuple[int, Image]]:
         """Take an image (H, W, 3) uint8 of a camera; return the panoramas (H, W, 3) uint8, with
         their stamps, that are complete now. Raises CameraError for an image of another camera.
@@ -136,6 +156,8 @@ class Surround:
         if not usable:  # a dark night, or a robot that stands: the panorama is judged as a whole
             usable = joined.images
             problems = {}
+        for name, problem in problems.items():
+            self.unused[name].add(problem)
         self._report({**joined.absent, **problems}, joined.stamp_ns)
         images = {name: image for name, (_, image) in usable.items()}
         view = self._view.view({name: image.shape[:2] for name, image in images.items()})
@@ -144,9 +166,17 @@ class Surround:
         shifts = {n: self._columns(joined.stamp_ns, at) for n, (at, _) in usable.items()}
         parts = self._view.parts(images, shifts)
         self._exposures.add(joined.stamp_ns, parts, view.overlaps)
+        self._watch_yaws(joined.stamp_ns, images)
         self._shown = view
         self._uses[frozenset(images)] += 1
         return self._view.joined(parts, view, self._exposures.factors)
+
+    def _watch_yaws(self, stamp_ns: int, images: Mapping[str, Image]) -> None:
+        """Compare what cameras see with what they saw, where a pose is known."""
+        if self._poses and abs(self._poses[-1][0] - stamp_ns) < _SAME_POSE_NS:
+            stamps_ns, poses = zip(*self._poses, strict=True)
+            path = Trajectory(np.array(stamps_ns), np.array(poses))
+            self._yaws.add(stamp_ns, path.at(np.array([stamp_ns]))[0], images)
 
     def _report(self, reasons: Mapping[str, str], stamp_ns: int) -> None:
         """Keep since when each camera has been in trouble."""

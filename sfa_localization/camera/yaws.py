@@ -24,14 +24,15 @@ from sfa_localization.camera.sectors import MountedCamera, Part, SurroundView
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.rig import Quantity
-from sfa_localization.data.run import Image
+from sfa_localization.data.run import Image, Stamps
 from sfa_localization.data.sphere import rotation
 from sfa_localization.data.statistics import outlier_factor, parabola_peak
 
 MOST_PAIRS = 200
 """Pairs of images that are compared; with 100 yaws are as certain to 0.1 degrees."""
+WITHIN_NS = 60_000_000_000
+"""Time between two images of a pair, for which odometry is good to a degree."""
 _WITHIN_M = 0.6  # between the robot's places of a pair
-_WITHIN_S = 60.0  # for which odometry is good to a degree
 _TURNED_RAD = np.radians(30.0)  # at least, else each camera sees what it saw before
 _ROWS = 12
 _WIDE_DEG = 36.0  # wider structures are light
@@ -109,22 +110,22 @@ class Yaws:
         return texts
 
 
-def pairs(stamps_ns: Array, poses: Array) -> list[tuple[int, int]]:
-    """Numbers of images at stamps (N,) and poses (N, 3) that show one place in two headings, each
-    image at most twice, the nearest first.
+def pairs(stamps_ns: Stamps, poses: Array, second: int | None = None) -> list[tuple[int, int]]:
+    """Numbers of images at stamps (N,) and poses (N, 3) that show one place in two headings, the
+    nearest first, each image at most twice; or those whose `second` image is given.
     """
-    first, second = cKDTree(poses[:, :2]).query_pairs(_WITHIN_M, output_type='ndarray').T
-    turned = np.abs(wrap_angle(poses[first, 2] - poses[second, 2])) > _TURNED_RAD
-    soon = np.abs(stamps_ns[first] - stamps_ns[second]) < _WITHIN_S * 1e9
-    fit = np.flatnonzero(turned & soon)
-    distance = np.hypot(*(poses[first[fit], :2] - poses[second[fit], :2]).T)
+    first, other = cKDTree(poses[:, :2]).query_pairs(_WITHIN_M, output_type='ndarray').T
+    turned = np.abs(wrap_angle(poses[first, 2] - poses[other, 2])) > _TURNED_RAD
+    soon = np.abs(stamps_ns[first] - stamps_ns[other]) < WITHIN_NS
+    fit = np.flatnonzero(turned & soon & ((second is None) | (other == second)))
+    distance = np.hypot(*(poses[first[fit], :2] - poses[other[fit], :2]).T)
     uses = np.zeros(len(poses), int)
     chosen: list[tuple[int, int]] = []
     for row in fit[np.argsort(distance, kind='stable')].tolist():
-        one, other = int(first[row]), int(second[row])
-        if max(uses[one], uses[other]) < 2 and len(chosen) < MOST_PAIRS:
-            uses[[one, other]] += 1
-            chosen.append((one, other))
+        pair = int(first[row]), int(other[row])
+        if uses[[*pair]].max() < 2 and len(chosen) < MOST_PAIRS:
+            uses[[*pair]] += 1
+            chosen.append(pair)
     return chosen
 
 
