@@ -28,7 +28,6 @@ BRIDGED_S = 3.0
 """Seconds for which the panorama may lack a camera, before that is a reason to doubt the pose."""
 _WATCHED = 2  # every second pixel shows a dark or frozen camera, at a quarter of the cost
 _RATES = 200  # of turns that are kept: those of a second or more
-_AT_ONCE_NS = 1_000_000  # a robot turns by less than a tenth of a column in this time
 _SAME_POSE_NS = 100_000_000  # between the last pose and images whose pose it tells
 _NEAR_NS = 200_000_000  # an older rate of turn says nothing about an image
 
@@ -59,8 +58,6 @@ class Surround:
         require_rig(names)
         self.cameras = tuple(cameras)
         self.troubles: dict[str, Trouble] = {}
-        self.is_skewed = False
-        """Whether cameras have taken images at different times, so that turns correct them."""
         self._view = SurroundView(cameras, panorama, blind_sectors)
         self._joiner = StampJoiner(names, patience)
         self._watches = {name: ImageWatch() for name in names}
@@ -91,12 +88,15 @@ class Surround:
 
     @property
     def problems(self) -> list[str]:
-        """Which cameras the panorama has lacked for longer than BRIDGED_S, and why."""
-        return [
+        """Which cameras the panorama has lacked for longer than BRIDGED_S, and why; and which look
+        elsewhere than their poses say.
+        """
+        lacked = [
             f'camera {name}: {trouble.reason}'
             for name, trouble in self.troubles.items()
             if self._stamp_ns > trouble.since_ns + BRIDGED_S * 1e9
         ]
+        return lacked + self.knocked
 
     @property
     def seen(self) -> Mask | None:
@@ -161,8 +161,6 @@ class Surround:
         self._report({**joined.absent, **problems}, joined.stamp_ns)
         images = {name: image for name, (_, image) in usable.items()}
         view = self._view.view({name: image.shape[:2] for name, image in images.items()})
-        apart_ns = max(abs(at - joined.stamp_ns) for at, _ in usable.values())
-        self.is_skewed |= apart_ns > _AT_ONCE_NS
         shifts = {n: self._columns(joined.stamp_ns, at) for n, (at, _) in usable.items()}
         parts = self._view.parts(images, shifts)
         self._exposures.add(joined.stamp_ns, parts, view.overlaps)

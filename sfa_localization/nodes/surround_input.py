@@ -157,14 +157,15 @@ class SurroundInput:
             images.start(*self._substitutes[name])
         if self.surround is None:
             self._descriptions.start()
-        self._follow_odometry()
+        self._listen_to_odometry()
 
     def stop(self) -> None:
         """End all subscriptions."""
         self._listens = False
         for images in self._inputs.values():
             images.stop()
-        self._follow_odometry()
+        self._node.unsubscribe(self._odometry)
+        self._odometry = None
         self._descriptions.stop()
 
     def _substitute(self, name: str, topic: str, kind: str) -> None:
@@ -178,28 +179,27 @@ class SurroundInput:
     def _take_odometry_of(self, topic: str, _: str) -> None:
         """Take odometry from a substitute for its topic."""
         self._odometry_topic = topic
-        self._node.require_input(_ODOM, topic)
-        self._node.unsubscribe(self._odometry)
-        self._odometry = None
-        self._follow_odometry()
+        if self._listens:
+            self._listen_to_odometry()
 
-    def _follow_odometry(self) -> None:
-        """Subscribe to the odometry while it is of use: its messages are the most frequent ones."""
-        is_of_use = self._listens and (self.surround is None or self.surround.is_skewed)
-        if is_of_use and self._odometry is None:
-            given = self._take_turn, sensor_qos(20), self._odometry_topic
-            self._odometry = self._node.subscribe(Odometry, _ODOM, *given)
-        elif not is_of_use:
-            self._node.unsubscribe(self._odometry)
-            self._odometry = None
+    def _listen_to_odometry(self) -> None:
+        self._node.unsubscribe(self._odometry)
+        given = self._take_motion, sensor_qos(20), self._odometry_topic
+        self._odometry = self._node.subscribe(Odometry, _ODOM, *given)
 
     # Messages.
 
-    def _take_turn(self, message: Odometry) -> None:
-        _, (_, omega, *_) = read_odometry(message)
+    def _take_motion(self, message: Odometry) -> None:
+        """Use the turn, which corrects images of different times, and the pose, which shows whether
+        cameras were turned.
+        """
+        pose, (_, omega, *_) = read_odometry(message)
+        stamp_ns = read_stamp(message.header.stamp)
         self._base = message.child_frame_id or _BASE
         if self.surround is not None:
-            self.surround.add_turn_rate(read_stamp(message.header.stamp), omega)
+            self.surround.add_turn_rate(stamp_ns, omega)
+        if self.surround is not None and pose is not None:
+            self.surround.add_pose(stamp_ns, np.array(pose))
 
     def _take(self, name: str, stamp_ns: int, image: Image, frame: str) -> None:
         """Use an image. Raises MessageError before all cameras are described, and CameraError."""
@@ -211,7 +211,6 @@ class SurroundInput:
             self._descriptions.stop()
         for panorama_ns, panorama in self.surround.add(name, stamp_ns, image):
             self._use(panorama_ns, panorama)
-            self._follow_odometry()
 
     def remake(self) -> None:
         """Begin anew with the same cameras after a change of parameters. Raises CameraError."""
@@ -239,8 +238,9 @@ class SurroundInput:
         visible = self.surround.visible
         if visible is not None:
             details['panorama visible [%]'] = f'{100 * visible.mean():.0f}'
-        text = '; '.join(f'camera {name}: {reason}' for name, (reason, _) in troubles.items())
-        return (WARN, text) if troubles else (OK, '')
+        texts = [f'camera {name}: {reason}' for name, (reason, _) in troubles.items()]
+        texts += self.surround.knocked
+        return (WARN, '; '.join(texts)) if texts else (OK, '')
 
 
 def _names(config: SurroundConfig, trained: Sequence[MountedCamera]) -> tuple[str, ...]:
