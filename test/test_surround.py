@@ -93,6 +93,30 @@ def test_poses_of_optical_frames_give_axes_and_place():
     )
 
 
+def at_five_meters(mounted, inverse):
+    """The image of a camera in a sphere of 5 m about the robot, and a camera for things there."""
+    place = np.array(mounted.place)
+
+    def scene(rays):
+        along = rays @ place
+        distance = np.sqrt(along**2 - place @ place + 25.0) - along
+        return smooth((place + distance[:, None] * rays) / 5.0)
+
+    return picture(mounted, scene), dataclasses.replace(mounted, inverse=inverse)
+
+
+@pytest.mark.parametrize(('inverse', 'most'), [(0.2, 0.7), (0.0, 6.0)])
+def test_things_at_the_composed_distance_lie_where_a_camera_in_the_middle_sees_them(inverse, most):
+    """At infinity they lie up to 3 degrees aside, of cameras 0.4 m off the middle."""
+    four = [camera(str(yaw), yaw, radius=0.4) for yaw in (0, 90, 180, 270)]
+    images, cameras = zip(*(at_five_meters(mounted, inverse) for mounted in four), strict=True)
+    surround = Surround(cameras, PANORAMA)
+    for number in range(3):
+        made = feed(surround, number, {c.name: i for c, i in zip(cameras, images, strict=True)})
+    error = np.abs(made[-1][1] - direct()).mean()
+    assert error < most and (error > 1.0) == (inverse == 0.0)
+
+
 def test_a_camera_is_stored_as_plain_values():
     for mounted in rig():
         stored = json.loads(json.dumps(dataclasses.asdict(mounted)))

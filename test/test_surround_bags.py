@@ -192,6 +192,7 @@ def test_errors_of_yaws_are_recovered_beside_parallax_and_turns():
     yaws = YawComparison(cameras, PanoramaConfig()).fit(sightings)
     estimated = np.degrees([yaws.errors[name].value for name in names])
     assert_allclose(estimated, np.degrees(errors), atol=0.1)
+    assert yaws.inverse == pytest.approx(0.2, abs=0.01)
     texts = yaws.sentences()
     assert [text.split(' (')[0] for text in texts] == [
         'camera front looks 2.0 degrees', 'camera rear looks 3.0 degrees',

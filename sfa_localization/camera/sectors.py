@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """One panorama from images of several cameras: where each of its pixels is read, and by which.
 
-It is composed at infinity: a ray from the robot's center is read along the same direction from each
-camera. With cameras 0.2 m off the center one image then errs by .045 m, with an ideal panorama by
-.041, and with a ground plane below the horizon by .045 too.
+It is composed on a sphere about the middle of the cameras, whose radius is the mean distance of
+things as training measures it. In a garden of 8 m x 8 m (7 m) one image and the filter err by .043
+and .037 m with four cameras 0.2 m off the center, and by .051 and .040 with 0.4 m; composed at
+infinity by .049 and .044, and by .064 and .051; with an ideal panorama by .041 and .040. Seams of 4
+degrees give what those of 10 do.
 """
 
 from __future__ import annotations
@@ -44,13 +46,15 @@ Part = NDArray[np.float32]
 class MountedCamera:
     """A camera on the robot: its `name`, its lens, and the pose of its optical frame (x along
     columns, y along rows, z into the scene, REP 103) on base_link: the rows of the rotation (3, 3)
-    to the axes of base_link, and its place, m.
+    to the axes of base_link, and its place, m. Panoramas are composed for things at an `inverse`
+    distance, 1/m, from the middle of all cameras; 0: far away.
     """
 
     name: str
     lens: LensCalibration
     rotation: tuple[tuple[float, ...], ...]
     place: tuple[float, ...] = (0.0, 0.0, 0.0)
+    inverse: float = 0.0
 
     @classmethod
     def at(cls, name: str, lens: LensCalibration, pose: Array) -> MountedCamera:
@@ -63,7 +67,8 @@ class MountedCamera:
         """From `dataclasses.asdict`, also as read from JSON. Raises ConfigError."""
         lens = LensCalibration.from_mapping(mapping['lens'], 'lens')
         rows = tuple(tuple(map(float, row)) for row in mapping['rotation'])
-        return cls(str(mapping['name']), lens, rows, tuple(map(float, mapping['place'])))
+        place = tuple(map(float, mapping['place']))
+        return cls(str(mapping['name']), lens, rows, place, float(mapping['inverse']))
 
     @property
     def ahead(self) -> Array:
@@ -99,9 +104,17 @@ class Sector(NamedTuple):
     maps: tuple[Any, Any]
 
     @classmethod
-    def of(cls, camera: MountedCamera, panorama: PanoramaConfig, size: tuple[int, int]) -> Sector:
-        """That of a camera for images of `size` (rows, columns). Raises CameraError."""
-        rays = panorama_rays(panorama)
+    def of(
+        cls,
+        camera: MountedCamera,
+        panorama: PanoramaConfig,
+        size: tuple[int, int],
+        aside: Array,
+    ) -> Sector:
+        """That of a camera `aside` (3,) of the middle, m, for images of `size` (rows, columns).
+        Raises CameraError.
+        """
+        rays = panorama_rays(panorama) - camera.inverse * aside
         model = turned_camera(camera.lens, size, np.array(camera.rotation), panorama)
         pixels = model.project(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
         visible = np.isfinite(pixels[..., 0])
@@ -170,6 +183,7 @@ class SurroundView:
     ) -> None:
         self.cameras = {camera.name: camera for camera in cameras}
         self.panorama = panorama
+        self._middle = np.mean([camera.place for camera in cameras], axis=0)
         self._blind = hidden_sectors(panorama_rays(panorama), blind_sectors)
         self._sectors: dict[str, tuple[tuple[int, int], Sector]] = {}
         self._views: dict[frozenset[str], View] = {}
@@ -177,7 +191,9 @@ class SurroundView:
     def sector(self, name: str, size: tuple[int, int]) -> Sector:
         """The sector of a camera for images of `size` (rows, columns). Raises CameraError."""
         if name not in self._sectors or self._sectors[name][0] != size:
-            self._sectors[name] = size, Sector.of(self.cameras[name], self.panorama, size)
+            camera = self.cameras[name]
+            aside = np.array(camera.place) - self._middle
+            self._sectors[name] = size, Sector.of(camera, self.panorama, size, aside)
             self._views.clear()
         return self._sectors[name][1]
 

@@ -79,15 +79,18 @@ class Sighting(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Yaws:
-    """How much cameras are turned beyond their stated poses, rad, by name."""
+    """How much cameras are turned beyond their stated poses, rad, by name, and the mean `inverse`
+    distance of what they see, 1/m.
+    """
 
     errors: dict[str, Quantity]
+    inverse: float = 0.0
 
     def corrected(self, cameras: Sequence[MountedCamera]) -> tuple[MountedCamera, ...]:
-        """The cameras as they are turned, where that is certain."""
+        """The cameras as they are turned, if that is certain, for things at the mean distance."""
         return tuple(
-            turned(camera, error.value) if (error := self._certain(camera.name)) else camera
-            for camera in cameras
+            turned(changed, error.value) if (error := self._certain(changed.name)) else changed
+            for changed in (replace(camera, inverse=self.inverse) for camera in cameras)
         )
 
     def _certain(self, name: str) -> Quantity | None:
@@ -135,7 +138,7 @@ class YawComparison:
     def __init__(self, cameras: Sequence[MountedCamera], panorama: PanoramaConfig) -> None:
         self._cameras = {camera.name: camera for camera in cameras}
         self._panorama = panorama
-        self._view = SurroundView(cameras, panorama)
+        self._view = SurroundView([replace(camera, inverse=0.0) for camera in cameras], panorama)
         self._per_column = 2 * np.pi / panorama.width * (-1.0 if panorama.clockwise else 1.0)
 
     def shown(self, pose: Array, images: Mapping[str, Image]) -> Shown:
@@ -227,7 +230,8 @@ class YawComparison:
         mean = np.eye(cameras) - 1.0 / cameras
         covariance = np.linalg.inv(information)[:cameras, :cameras]
         std = np.sqrt(np.diag(mean @ covariance @ mean))
-        return Yaws(dict(zip(names, map(Quantity, errors.tolist(), std.tolist()), strict=True)))
+        quantities = map(Quantity, errors.tolist(), std.tolist())
+        return Yaws(dict(zip(names, quantities, strict=True)), max(float(solution[cameras]), 0.0))
 
     def _design(self, sightings: Sequence[Sighting]) -> Array:
         """Derivatives of shifts by yaws, the inverse distance of things, and turns of pairs."""
