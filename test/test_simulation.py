@@ -23,7 +23,7 @@ from sfa_localization.data.geometry import compose, relative, wrap_angle
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.data.run import integrate
 from sfa_localization.simulation import drive as drives
-from sfa_localization.simulation.cameras import cameras_of
+from sfa_localization.simulation.cameras import simulated_cameras
 from sfa_localization.simulation.drive import START_NS, drive, lights, render_images, simulate
 from sfa_localization.simulation.garden import Garden, panel, rounded
 from sfa_localization.simulation.rendering import Dome, Light, Scene, panorama_view, raw_view
@@ -312,7 +312,7 @@ def test_cameras_differ_by_place_exposure_and_time_as_asked(tmp_path, tiny):
     assert [stamp for stamp, _ in images['front']] == stamps.tolist()
     assert [stamp for stamp, _ in images['rear']] == (stamps + 33_000_000).tolist()
     (_, front), (later, rear) = images['front'][1], images['rear'][1]
-    ahead, behind = cameras_of(replace(config, camera_exposures=(), cameras=2))
+    ahead, behind = simulated_cameras(replace(config, camera_exposures=(), cameras=2))
     there = driven.truth.at(np.array([stamps[1], later]))
     expected = (
         tiny.image(compose(there[0], np.array([0.5, 0.0, 0.0])), ahead.view),
@@ -341,7 +341,7 @@ def test_uneven_ground_tilts_all_cameras_of_the_robot_alike(tiny):
     """The tilt is that of the robot, not of the ground below each camera."""
     config = replace(FOUR, terrain=5.0, camera_size=(64.0, 48.0), length=2.0)
     recorded = drive(tiny, config)
-    (camera, *_), pose = cameras_of(config), recorded.image_poses[0]
+    (camera, *_), pose = simulated_cameras(config), recorded.image_poses[0]
     (image,) = islice(render_images(tiny, recorded, config, camera.view, 0.3j), 1)
     tilt = drives.roll_and_pitch(pose, config, 0)
     beside = compose(pose, np.array([0.0, 0.3, 0.0]))

@@ -53,7 +53,7 @@ class SimulatedCamera:
         return f'{self.mounted.name}_optical_frame'
 
 
-def cameras_of(config: SimulationConfig) -> list[SimulatedCamera]:
+def simulated_cameras(config: SimulationConfig) -> list[SimulatedCamera]:
     """The cameras of a robot, evenly around it, the first looking ahead. Raises ConfigError."""
     count = config.cameras
     if count and config.images == 'panorama':

@@ -25,7 +25,7 @@ from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.progress import progress_over
 from sfa_localization.data.run import Image, Odometry, Stamps, Trajectory, YawRate, integrate
-from sfa_localization.simulation.cameras import SimulatedCamera, cameras_of
+from sfa_localization.simulation.cameras import SimulatedCamera, simulated_cameras
 from sfa_localization.simulation.garden import Garden, rounded
 from sfa_localization.simulation.rendering import Light, View, panorama_view, raw_view
 from sfa_localization.simulation.routes import ROUTES, Lawn, Motion, Route
@@ -291,7 +291,7 @@ def record(
     """
     label = f'render the images of {out.name}'
     shown = partial(progress_over, desc=label, total=len(driven.image_stamps_ns), visible=progress)
-    cameras = cameras_of(config)
+    cameras = simulated_cameras(config)
     with BagWriter(out, config.storage) as bag:
         if cameras:
             images = _of_cameras(bag, driven, garden, config, cameras, shown)
