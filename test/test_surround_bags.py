@@ -12,11 +12,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rigs import START, camera, fisheye, rig, smooth, speckled, write_bag
 from test_surround import direct
 
+from sfa_localization import cli
 from sfa_localization.bags.drives import ReadingRecipe, as_live, images_at, read_drive
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.bags.surround_drive import with_cameras, yaws_of
 from sfa_localization.bags.surround_topics import camera_name, cameras_of
+from sfa_localization.camera.encodings import read_image
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.camera.yaws import KNOCKED_RAD, Sighting, YawComparison, pairs, turned
 from sfa_localization.data.errors import BagError, CameraError
@@ -233,6 +235,23 @@ def test_yaws_of_the_right_cameras_stay(whirl):
     bag, true = whirl
     recipe = replace(with_cameras(bag, ReadingRecipe()), surround=tuple(true))
     assert yaws_of(bag, recipe).sentences(np.radians(0.5)) == []
+
+
+def test_calibrate_draws_the_seams_and_says_how_the_cameras_look(whirl, tmp_path, capsys):
+    bag, _ = whirl
+    check = tmp_path / 'check.png'
+    assert cli.main(['calibrate', str(bag), '--check', str(check)]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith('4 cameras are one panorama, looking to front 3, left 90, rear 169')
+    assert 'camera rear looks 1' in told and 'of what /tf_static says' in told
+    image = read_image(check)
+    assert image.shape == (200, 1200, 3)
+    yellow = (image == (60, 230, 250)).all(axis=2).mean(axis=0)
+    seams = np.flatnonzero(yellow > 0.5)
+    azimuth = 180 - (seams + 0.5) * 0.3
+    assert all(np.abs(azimuth - seam).min() < 4 for seam in (46.5, 129, -46.5, -140))
+    assert cli.main(['calibrate', str(bag), '--output', str(tmp_path / 'camera.yaml')]) == 1
+    assert 'give only --check' in capsys.readouterr().err
 
 
 def test_scenes_of_the_tests_tell_directions_apart():

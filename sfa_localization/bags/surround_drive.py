@@ -72,6 +72,16 @@ def yaws_of(bag: Path, recipe: ReadingRecipe, progress: bool = False) -> Yaws:
     return comparison.fit(sightings)
 
 
+def first_panorama(bag: Path, recipe: ReadingRecipe) -> tuple[Image, Surround]:
+    """The first panorama of the cameras of a recipe, and what made it. Raises BagError."""
+    with Bag(bag, config=recipe.bag) as opened:
+        topics = topics_like(opened, recipe.topics.image, recipe.surround)
+        around = Surround(recipe.surround, recipe.panorama, recipe.camera.blind_sectors, PATIENCE)
+        stream = SurroundStream(opened, topics, around, around.compose)
+        read = opened.read(stream.cameras.values())
+        return next((image, around) for used, _, image in read if used is stream.panoramas)
+
+
 def _times(bag: Path, recipe: ReadingRecipe) -> tuple[list[Joined], Array]:
     """The stamps of the images of one time, without the images, and the poses (N, 3) then."""
     with Bag(bag, config=recipe.bag) as opened:

@@ -238,6 +238,15 @@ class SurroundView:
         }
         return View(shares, visible, repeated, overlaps)
 
+    def owners(self, view: View) -> Indices:
+        """The number of the camera that shows most of each pixel (H, W) of a view; -1: hidden."""
+        size = self.panorama.height, self.panorama.width
+        shares = np.zeros((len(self.cameras), *size))
+        for number, name in enumerate(self.cameras):
+            if name in view.shares:
+                shares[number][:, self.known(name).columns] = view.shares[name][..., 0]
+        return np.asarray(np.where(view.visible, shares.argmax(axis=0), -1))
+
     def parts(
         self, images: Mapping[str, Image], shifts: Mapping[str, float] | None = None
     ) -> dict[str, Part]:

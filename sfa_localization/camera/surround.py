@@ -18,7 +18,7 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.camera.yaw_watch import YawWatch
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.geometry import Array, Mask
+from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.rejections import RejectionCounter
 from sfa_localization.data.run import Image, Trajectory
 
@@ -97,6 +97,13 @@ class Surround:
             if self._stamp_ns > trouble.since_ns + BRIDGED_S * 1e9
         ]
         return lacked + self.knocked
+
+    @property
+    def owners(self) -> Indices | None:
+        """The number of the camera that shows most of each pixel (H, W) of the last panorama, -1
+        where it is hidden; None before it.
+        """
+        return None if self._shown is None else self._view.owners(self._shown)
 
     @property
     def seen(self) -> Mask | None:
