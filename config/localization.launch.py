@@ -35,6 +35,11 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument('namespace', default_value='', description='namespace of the nodes'),
         DeclareLaunchArgument('image', default_value='image_raw', description="camera's topic"),
         DeclareLaunchArgument(
+            'cameras',
+            default_value='',
+            description='names of several cameras, as front,left,rear,right; a model has its own',
+        ),
+        DeclareLaunchArgument(
             'panorama', default_value='', description='topic of panoramas, without an omnicam_node'
         ),
         DeclareLaunchArgument(
@@ -84,25 +89,26 @@ def _nodes(context: LaunchContext) -> list:
     start = {'autostart': _is_true(given, 'autostart')} if given['autostart'] else {}
     node = partial(_node, file, start)
     transport = {'image_transport': given['image_transport']}
+    # Without the argument, the parameter file or the model decides.
+    cameras = {'cameras': given['cameras'].split(',')} if given['cameras'] else {}
     model = {'model': given['model']}
     image, panorama = given['image'], given['panorama']
     images = [('image_raw', image), ('image_raw/compressed', f'{image}/compressed')]
-    images.append(('imu/data', given['imu']))
+    images += [('imu/data', given['imu']), ('odom', given['odom'])]
     # As Nav2 does, so that robots with frames of the same names do not meet on /tf.
     odometry = [('odom', given['odom']), ('/tf', given['tf'])]
     static = [('/tf_static', f'{given["tf"]}_static')]
     if _is_true(given, 'composed'):
         if panorama or given['ekf'] != 'true':
             raise ValueError('composed:=true runs all nodes: leave panorama:= and ekf:= out')
-        chain = node('localization', images + odometry + static, {**model, **transport})
+        every = [*images, *odometry[1:], *static]
+        chain = node('localization', every, {**model, **transport, **cameras})
         return [PushROSNamespace(given['namespace']), chain, _rviz(given)]
     if panorama:
         seeing = [node('sfa_node', [('panorama', panorama), *static], {**model, **transport})]
     else:
-        seeing = [
-            node('omnicam_node', images, {**model, **transport}),
-            node('sfa_node', static, model),
-        ]
+        several = {**model, **transport, **cameras}
+        seeing = [node('omnicam_node', images, several), node('sfa_node', static, model)]
     ekf = node('ekf_node', odometry, {}, condition=IfCondition(given['ekf']))
     return [PushROSNamespace(given['namespace']), *seeing, ekf, _rviz(given)]
 

@@ -19,6 +19,7 @@ from sfa_localization.camera.settings import (
     CameraConfig,
     CaptureConfig,
     PanoramaConfig,
+    SurroundConfig,
     WatchConfig,
 )
 from sfa_localization.data.errors import ConfigError
@@ -40,7 +41,14 @@ from sfa_localization.sfa.settings import NetworkConfig
 
 S = TypeVar('S', bound=Settings)
 SECTIONS: dict[str, tuple[type[Settings], ...]] = {
-    'omnicam_node': (NodeConfig, OmnicamNodeConfig, CaptureConfig, CameraConfig, PanoramaConfig),
+    'omnicam_node': (
+        NodeConfig,
+        OmnicamNodeConfig,
+        CaptureConfig,
+        CameraConfig,
+        SurroundConfig,
+        PanoramaConfig,
+    ),
     'sfa_node': (NodeConfig, SfaNodeConfig, WatchConfig),
     'ekf_node': (NodeConfig, EkfNodeConfig, FilterConfig),
     'teach_node': (NodeConfig, TeachNodeConfig, TopicNames),
@@ -72,12 +80,16 @@ def load_settings(path: Path | str, section: str, kind: type[S]) -> S:
 
 
 def resolved_beside(settings: S, path: Path | str) -> S:
-    """Settings of a parameter file, whose relative calibration_file lies beside it."""
-    if not isinstance(settings, CameraConfig) or not settings.calibration_file:
-        return settings
-    return dataclasses.replace(
-        settings, calibration_file=str(Path(path).parent / settings.calibration_file)
-    )
+    """Settings of a parameter file, whose relative calibration files lie beside it."""
+    folder = Path(path).parent
+    if isinstance(settings, CameraConfig) and settings.calibration_file:
+        return dataclasses.replace(
+            settings, calibration_file=str(folder / settings.calibration_file)
+        )
+    if isinstance(settings, SurroundConfig):
+        files = tuple(str(folder / file) for file in settings.camera_files)
+        return dataclasses.replace(settings, camera_files=files)
+    return settings
 
 
 def load_section(path: Path, section: str) -> dict[str, Any]:

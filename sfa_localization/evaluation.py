@@ -23,7 +23,9 @@ from scipy import signal, stats
 
 from sfa_localization.bags.drives import as_live, image_folder, read_drive
 from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.surround_drive import yaws_of
 from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.camera.yaws import KNOCKED_RAD
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import (
     Array,
@@ -126,7 +128,7 @@ def evaluate(
     smoothed after the drive. Unusable images count as skipped observations. Raises BagError or
     DataError, also without ground truth.
     """
-    recipe = as_live(recipe or Recipe(), model.panorama, model.lens)
+    recipe = as_live(recipe or Recipe(), model.panorama, model.lens, model.surround)
     recipe = replace(recipe, origin=model.origin)
     drives = list[_Located]()
     for path in align_bags:
@@ -142,7 +144,17 @@ def evaluate(
         fitted = drives[: len(align_bags) or 1]
         transform = fit_transform(*((d.true.poses, d.images.poses) for d in fitted))
     corrections = tuple(f'{d.run.name}: {text}' for d in drives for text in d.sentences)
+    corrections += _knocked(bag, recipe, progress)
     return _judged(drives[-1], localizer.filter, transform, aligned_on, corrections)
+
+
+def _knocked(bag: Path, recipe: Recipe, progress: bool) -> tuple[str, ...]:
+    """Sentences about cameras of a rig that were turned since the training."""
+    if not recipe.surround:
+        return ()
+    texts = yaws_of(bag, recipe, progress).sentences(KNOCKED_RAD)
+    remedy = 'of what it was in training: mount it as it was, or train again'
+    return tuple(f'{bag.name}: {text} {remedy}' for text in texts)
 
 
 def _judged(

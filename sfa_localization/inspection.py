@@ -23,10 +23,13 @@ from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S, ReadingRecipe, un
 from sfa_localization.bags.lens_drive import lens_of
 from sfa_localization.bags.motion_arrays import stamps_of, to_yaw_rate
 from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.surround_topics import PATIENCE, SurroundStream, cameras_of, topics_of
 from sfa_localization.bags.topic_stream import Stream, by_one_clock
-from sfa_localization.camera import body, kinds, lens_report
+from sfa_localization.camera import body, kinds, lens_report, surround
+from sfa_localization.camera.joining import Joined
 from sfa_localization.camera.leveling import leaning
 from sfa_localization.camera.panorama import looks_like_panorama
+from sfa_localization.camera.sectors import MountedCamera, visible_elevations
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import FrozenWatch, frozen
@@ -157,7 +160,8 @@ class BagReport:
 
     `error` says why it cannot be read at all. `samples` are images from all over the drive,
     `camera` the kind of camera that they show, `lens` a sentence about its lens, which the settings
-    describe or not (`is_described`). `drives` are the poses (M, 3) of images with `odometry` in
+    describe or not (`is_described`). `cameras` is one about several that make a panorama;
+    `image_topic` is the first of theirs. `drives` are the poses (M, 3) of images with `odometry` in
     each unbroken part of it; `motion` compares odometry, images and gyroscope; `tilt` is that of
     the ground.
     """
@@ -170,6 +174,7 @@ class BagReport:
     lacks: list[str] = field(default_factory=list)
     of_drive: list[str] = field(default_factory=list)
     image_topic: str = ''
+    cameras: str = ''
     camera: kinds.CameraKind | None = None
     is_described: bool = False
     lens: str = ''
@@ -195,6 +200,8 @@ class BagReport:
     def facts(self) -> dict[str, str]:
         """Sentences about camera, drive, stops and ground."""
         facts = {}
+        if self.cameras:
+            facts['cameras'] = self.cameras
         if self.camera is not None:
             facts['images'] = str(self.camera)
         if self.lens:
@@ -265,9 +272,9 @@ def inspect(
     config = config or InspectionConfig()
     report = BagReport(str(path), is_described=recipe.camera.is_described)
     with Bag(path, strict=strict, config=recipe.bag) as bag:
-        report.image_topic = _topic_of(bag, 'image', recipe.topics.image, report)
         report.odometry_topic = _topic_of(bag, 'odometry', recipe.topics.odometry, report)
-        _Survey(bag, report, recipe).fill()
+        cameras = _cameras_of(bag, recipe.topics.image, report)
+        _Survey(bag, report, recipe, cameras).fill()
         report.problems = bag.problems
         report.notes += bag.recording.notes
     _see_lens(report, recipe)
@@ -284,7 +291,7 @@ def inspect(
 
 def _see_lens(report: BagReport, recipe: ReadingRecipe) -> None:
     """Fill in the lens that the drive shows, or what is missing to see it."""
-    if report.camera is None or report.sees_a_part or report.odometry is None:
+    if report.camera is None or report.sees_a_part or report.odometry is None or report.cameras:
         return
     try:
         lens = lens_of(Path(report.path), recipe)
@@ -312,6 +319,19 @@ def _topic_of(bag: Bag, kind: str, name: str, report: BagReport) -> str:
         return ''
 
 
+def _cameras_of(bag: Bag, named: str, report: BagReport) -> tuple[MountedCamera, ...]:
+    """The cameras around the robot whose images make a panorama; () for one, or without images."""
+    try:
+        cameras = cameras_of(bag, named, report.odometry_topic)
+        topics = topics_of(bag, named).values() if cameras else [bag.find('image', named)]
+    except BagError as error:
+        report.lacks.append(str(error).removeprefix(f'{bag.path}: '))
+        return ()
+    report.image_topic = next(iter(topics))
+    report.cameras = surround.sentence(cameras) if cameras else ''
+    return cameras
+
+
 class _View(NamedTuple):
     """What is kept of an image: the turn of the camera since the first image, rad, a small texture,
     None if it repeats the last image, and of some panoramas the local contrast.
@@ -325,7 +345,13 @@ class _View(NamedTuple):
 class _Survey:
     """One pass over all topics of a bag."""
 
-    def __init__(self, bag: Bag, report: BagReport, recipe: ReadingRecipe) -> None:
+    def __init__(
+        self,
+        bag: Bag,
+        report: BagReport,
+        recipe: ReadingRecipe,
+        cameras: tuple[MountedCamera, ...],
+    ) -> None:
         topics = recipe.topics
         clockwise = recipe.panorama.clockwise
         self._bag = bag
@@ -339,10 +365,11 @@ class _Survey:
         self._rolls_and_pitches: list[tuple[float, float]] = []
         has_imu = bag.has('imu', topics.imu)
         imu = _topic_of(bag, 'imu', topics.imu, report) if has_imu else ''
-        self._used = dict[str, Stream]()
+        self._used = self._joined(cameras, topics.image) if cameras else dict[str, Stream]()
+        single = '' if cameras else report.image_topic
         # Without a topic, '' is no name: in damaged bags, it can be one.
         for use, name, convert in (
-            ('images', report.image_topic, self._take),
+            ('images', single, self._take),
             ('odometry', report.odometry_topic, decoding.odometry_of),
             ('imu', imu, self._yaw_rate),
         ):
@@ -352,6 +379,18 @@ class _Survey:
         count = bag.topics[report.image_topic].count if report.image_topic else 0
         self._every = max(count // SAMPLES, 1)
         self._tilt_every = -(-count // body.IMAGES) or 1
+
+    def _joined(self, cameras: tuple[MountedCamera, ...], named: str) -> dict[str, Stream]:
+        """The stream of the panoramas of several cameras, and those of the cameras."""
+        panorama = PanoramaConfig(clockwise=self._sphere.clockwise)
+        panorama = lens_report.fitting_panorama(panorama, visible_elevations(cameras))
+        around = surround.Surround(cameras, panorama, patience=PATIENCE)
+
+        def take(images: Joined) -> _View:
+            return self._take(around.compose(images))
+
+        joined = SurroundStream(self._bag, topics_of(self._bag, named), around, take)
+        return {'images': joined.panoramas, **joined.cameras}
 
     def fill(self) -> None:
         """Read the bag, and fill the report."""

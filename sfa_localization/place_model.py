@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.camera.leveling import leveled
-from sfa_localization.camera.panorama import filled
+from sfa_localization.camera.panorama import filled, repeated_columns
+from sfa_localization.camera.sectors import MountedCamera
 from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.array_files import Arrays, read_arrays, read_header, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
@@ -75,7 +76,8 @@ class PlaceModel:
     maps, or slow features where there are none. Where the robot hides its view, pixels (H, W)
     repeat those of `repeated`. `lens` is that of the camera, with its mounting, or None for
     panoramas that were used as they are; `lean`, rad, are roll and pitch of the camera then, which
-    images show; () if there are none.
+    images show; () if there are none. The `surround` are the cameras whose images make a panorama,
+    if they are several.
     """
 
     network: Network
@@ -90,6 +92,7 @@ class PlaceModel:
     repeated: Indices | None = None
     lens: LensCalibration | None = None
     lean: tuple[float, ...] = ()
+    surround: tuple[MountedCamera, ...] = ()
 
     def locate(self, panorama: Image) -> Observation:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
@@ -119,16 +122,26 @@ class PlaceModel:
     def views(self, panoramas: Image) -> list[View]:
         """Textures of panoramas (T, H, W, 3), leveled by keyframes."""
         require_size(panoramas, self.network.architecture)
-        level = [upright(self.keyframes, image) for image in panoramas]
+        level = [upright(self._comparable(image), image) for image in panoramas]
         maps = self.network.maps(np.stack([image.panorama for image in level]))
         spectra = spectrum(maps[min(TURNED_LAYER, len(maps) - 1)])
         return list(map(View, level, slow_features(maps), spectra))
 
     def located(self, view: View, conditions: Conditions) -> Location:
         """Where the camera was, by keyframes and slow features in the current conditions."""
-        fits, tilt = hypotheses(self.keyframes, view.upright, conditions.pattern)
+        keyframes = self._comparable(view.upright.seen)
+        fits, tilt = hypotheses(keyframes, view.upright, conditions.pattern)
         slow = self._slow_places(view, fits)
         return located(fits, slow, conditions.scales, self.keyframes.errors, tilt)
+
+    def _comparable(self, panorama: Image) -> Keyframes:
+        """The keyframes, compared only where the panorama (H, W, 3) of several cameras shows more
+        than repeated columns: where a camera is missing.
+        """
+        hidden = repeated_columns(panorama) if self.surround else np.zeros(1, bool)
+        if not hidden.any() or hidden.all():
+            return self.keyframes
+        return self.keyframes.seeing(np.broadcast_to(~hidden, panorama.shape[:2]))
 
     def _slow_places(self, view: View, fits: Sequence[Fit]) -> tuple[Array, Array]:
         """Where the map puts an image at the heading of each of H hypotheses, (H, 2) m, and its
@@ -206,6 +219,7 @@ class PlaceModel:
 
     def _header(self) -> dict[str, Any]:
         architecture = dataclasses.asdict(self.network.architecture)
+        several = [dataclasses.asdict(camera) for camera in self.surround]
         return {
             'format': FORMAT,
             'version': VERSION,
@@ -217,6 +231,7 @@ class PlaceModel:
             'rig': self.rig.to_mapping(),
             'lens': None if self.lens is None else dataclasses.asdict(self.lens),
             'lean': self.lean,
+            **({'surround': several} if several else {}),
         }
 
     def _arrays(self) -> Arrays:
@@ -250,16 +265,30 @@ class PlaceModel:
             arrays.get('repeated'),
             lens_from(header),
             tuple(header.get('lean', ())),
+            surround_from(header),
         )
 
 
 def camera_of(path: Path | str) -> tuple[PanoramaConfig, LensCalibration | None]:
     """Panorama and lens of a model, without reading the rest. Raises ModelError."""
-    path = Path(path).expanduser()
+    panorama, lens, _ = _cameras(Path(path).expanduser())
+    return panorama, lens
+
+
+def surround_of(path: Path | str) -> tuple[MountedCamera, ...]:
+    """The cameras whose images make the panorama of a model; () for one. Raises ModelError."""
+    return _cameras(Path(path).expanduser())[2]
+
+
+def _cameras(
+    path: Path,
+) -> tuple[PanoramaConfig, LensCalibration | None, tuple[MountedCamera, ...]]:
+    """Panorama, lens, and several cameras of a model. Raises ModelError."""
     header = read_header(path, FORMAT, VERSION, _REMEDY)
     try:
-        return PanoramaConfig.from_mapping(header['panorama'], 'panorama'), lens_from(header)
-    except (ConfigError, KeyError, TypeError) as error:
+        panorama = PanoramaConfig.from_mapping(header['panorama'], 'panorama')
+        return panorama, lens_from(header), surround_from(header)
+    except (ConfigError, KeyError, TypeError, ValueError) as error:
         raise _damaged(path, str(error)) from None
 
 
@@ -267,6 +296,11 @@ def lens_from(header: Mapping[str, Any]) -> LensCalibration | None:
     """The lens in a model file's header. Raises ConfigError."""
     lens = header['lens']
     return None if lens is None else LensCalibration.from_mapping(lens, 'lens')
+
+
+def surround_from(header: Mapping[str, Any]) -> tuple[MountedCamera, ...]:
+    """The cameras around the robot in a model file's header. Raises ConfigError."""
+    return tuple(map(MountedCamera.from_mapping, header.get('surround', ())))
 
 
 def require_panorama(image: object) -> None:

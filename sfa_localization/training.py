@@ -92,7 +92,8 @@ def train(
     recipe, lens = with_lens(bags, recipe, progress)
     runs = read_drives(bags, cache, recipe, progress, strict=strict)  # step 1
     runs, checks = compared(runs, recipe, force)
-    settings = (recipe.network, recipe.architecture, recipe.panorama, recipe.camera, recipe.lens)
+    camera = (recipe.panorama, recipe.camera, recipe.lens, recipe.surround)
+    settings = (recipe.network, recipe.architecture, *camera)
     checkpoint = Checkpoint.beside(output, settings, runs)
     if not resume:
         checkpoint.remove()
@@ -170,5 +171,6 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         repeated=None if given.seen is None else repeated_pixels(given.seen),
         lean=tuple(given.lean.tolist()) if given.lean.any() else (),
         lens=replace(given.recipe, panorama=given.panorama).unwrapper.lens,
+        surround=given.recipe.surround,
     )
     return Trained(model, given.runs, images.slow, segments, result)

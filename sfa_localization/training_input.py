@@ -14,6 +14,7 @@ import numpy as np
 
 from sfa_localization.bags.drives import ReadingRecipe
 from sfa_localization.bags.lens_drive import lens_of
+from sfa_localization.bags.surround_drive import with_cameras, yaws_of
 from sfa_localization.camera import body, lens_report
 from sfa_localization.camera.kinds import require_single_view
 from sfa_localization.camera.learned_lens import PLACE_STD_M, LearnedLens
@@ -189,8 +190,15 @@ def with_lens(
     """The recipe with the lens, and the elevations, that the first bag to show them shows.
 
     A described lens stays, and is compared with that of the drive. Raises BagError, and CameraError
-    where no bag shows the lens of images that are no panoramas.
+    where no bag shows the lens of images that are no panoramas. Several cameras around the robot
+    have the lenses of their camera_info, and yaws that the drive corrects.
     """
+    around = with_cameras(bags[0], recipe)
+    if around.surround:
+        yaws = yaws_of(bags[0], around, progress)
+        for text in yaws.sentences():
+            logger.warning('%s: %s of what /tf_static says: taken into account', bags[0], text)
+        return replace(around, surround=yaws.corrected(around.surround)), None
     lens = None
     problems = list[CameraError]()
     for bag in bags:
@@ -211,7 +219,7 @@ def with_lens(
     logger.info('%s', lens_report.sentence(lens))
     for text in lens_report.advice(lens):
         logger.warning('%s', text)
-    panorama = lens_report.fitting_panorama(recipe.panorama, lens)
+    panorama = lens_report.fitting_panorama(recipe.panorama, lens.sees)
     return replace(recipe, lens=lens.calibration, panorama=panorama), lens
 
 

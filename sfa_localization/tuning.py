@@ -72,7 +72,7 @@ def read_drive(
     bag: Path, model: PlaceModel, recipe: Recipe, watch: WatchConfig | None, want_truth: bool
 ) -> TuningDrive:
     """A bag's odometry, and the poses of its images by the model. Raises BagError, DataError."""
-    live = as_live(recipe, model.panorama, model.lens)
+    live = as_live(recipe, model.panorama, model.lens, model.surround)
     run, observations = observed(bag, Observer(model, watch), live, True, want_truth)
     usable = sum(not image.problem for image in observations)
     if usable < MIN_IMAGES:

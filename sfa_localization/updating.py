@@ -117,7 +117,7 @@ def update(
 
     Raises BagError, DataError or ModelError; then no model is written.
     """
-    recipe = as_live(recipe or ReadingRecipe(), model.panorama, model.lens)
+    recipe = as_live(recipe or ReadingRecipe(), model.panorama, model.lens, model.surround)
     added = []
     cache = image_folder(Path(output))
     for bag in bags:

@@ -60,6 +60,7 @@ class PictureReader:
     rig: Rig = dataclasses.field(default_factory=Rig)
     ground: DrivenGround = dataclasses.field(default_factory=lambda: DROVE)
     lens: LensCalibration | None = None
+    surround: tuple = ()
 
     def prepared(self, images):
         return images

@@ -27,6 +27,7 @@ pytestmark = pytest.mark.usefixtures('gardens', 'small_network')
 
 # Each option alone, on small inputs: what a command is given without it, and the option.
 
+CAMERAS = '{out}/bag --area 6x6 --length 4 --images-every 2 --cameras 2'
 BASE = {
     'simulate': '{out}/bag --area 6x6 --length 4 --images panorama --size 32x8 --images-every 1',
     'train': '{data}/bag --output {out}/model.npz --config {data}/small.yaml',
@@ -42,6 +43,12 @@ BASE = {
     'demo': '--out {out}/demo',
     # For these options something else.
     'simulate --trajectory': '{out}/bag --area 6x6 --images panorama --size 32x8 --images-every 10',
+    'simulate --cameras': '{out}/bag --area 6x6 --length 4 --images-every 2',
+    'simulate --camera-size': f'{CAMERAS} --camera-fov 150',
+    'simulate --camera-fov': f'{CAMERAS} --camera-size 32x24',
+    'simulate --camera-radius': f'{CAMERAS} --camera-size 32x24',
+    'simulate --camera-exposures': f'{CAMERAS} --camera-size 32x24',
+    'simulate --camera-skew': f'{CAMERAS} --camera-size 32x24',
     'simulate --test-drift': '{out}/bag --area 6x6 --trajectory test --size 32x8 --images-every 9',
     'train --strict': '{data}/cut --output {out}/model.npz --config {data}/small.yaml',
     'train --force': '{data}/bag --output {out}/model.npz --config {data}/counterclockwise.yaml',
@@ -56,7 +63,9 @@ CASES = {
         --area 9x7; --length 8; --images raw; --images-every 0.5; --images-every-turn 5
         --compression png; --storage sqlite3; --image-noise 0; --illumination 1; --terrain 3
         --speed 0.5; --odometry-rate 20; --test-drift 1; --scale-error 0.1; --slip 0.3
-        --speed-noise 0.5; --gyro-bias 0.05; --gyro-noise 0.1""",
+        --speed-noise 0.5; --gyro-bias 0.05; --gyro-noise 0.1
+        --cameras 3; --camera-fov 190; --camera-radius 1; --camera-size 40x24
+        --camera-exposures 1x0.5; --camera-skew 0x33""",
     'train': """
         --output {out}/other.npz; --config {data}/fewer.yaml; --report {out}/report; --resume
         --json {out}/judgment.json

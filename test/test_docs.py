@@ -192,6 +192,7 @@ def test_the_table_of_topics_is_that_of_the_nodes(bench, monkeypatch, tmp_path):
     load_pictures(monkeypatch)
     nodes = [
         bench.run(omnicam_node.OmnicamNode, level_by_imu=True),
+        bench.run(omnicam_node.OmnicamNode, cameras=['NAME', 'NAME2']),
         bench.run(sfa_node.SfaNode, model='model.npz'),
         bench.run(ekf_node.EkfNode),
         bench.run(teach_node.TeachNode, output=str(tmp_path / 'garden.npz')),
@@ -199,14 +200,18 @@ def test_the_table_of_topics_is_that_of_the_nodes(bench, monkeypatch, tmp_path):
 
     def topics_of(entities):
         return {
-            (entity.topic_name[1:], entity.msg_type.__name__, f' `{node.get_name()}` ')
+            (
+                entity.topic_name[1:].replace('NAME2', 'NAME'),
+                entity.msg_type.__name__,
+                f' `{node.get_name()}` ',
+            )
             for node in nodes for entity in getattr(node, entities)
             if not OTHER_TOPICS.fullmatch(entity.topic_name)
         }  # fmt: skip
 
     rows = TOPIC_ROW.findall(PAGES['config/README.md'])
     published = {row[:3] for row in rows if '_node' in row[2] and row[0] != 'tf'}
-    read = {(topic, kind, node) for topic, kind, _, node in rows if '_node' in node}
+    read = {row[:2] + row[3:] for row in rows if '_node' in row[3] and row[0] != 'tf_static'}
     raw = {row for row in read if not row[0].endswith(('/compressed', '/ffmpeg', '/foxglove'))}
     assert topics_of('publishers') == published
     assert until(lambda: topics_of('subscriptions') == raw)
@@ -395,6 +400,10 @@ def test_launch_file_starts_all_nodes_with_their_parameters_and_topics(launch):
     with pytest.raises(ValueError, match='autostart:=on: give true or false'):
         launch(autostart='on')
     assert ('imu/data', '/imu') in launch(imu='/imu')['omnicam_node']['remappings']
+    assert ('odom', 'wheels') in launch(odom='wheels')['omnicam_node']['remappings']
+    assert 'cameras' not in launched['omnicam_node']['parameters'][1]
+    several = launch(cameras='front,rear')['omnicam_node']['parameters'][1]
+    assert several['cameras'] == ['front', 'rear']
     assert without['sfa_node']['parameters'][1]['image_transport'] == 'compressed'
     panorama = dict(without['sfa_node']['remappings'])['panorama']
     odometry = dict(without['ekf_node']['remappings'])['odom']

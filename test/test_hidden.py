@@ -70,6 +70,18 @@ def errors(keyframes, config=CONFIG):
     return lengths(off).mean(), np.abs(wrap_angle(off[:, 2])).mean()
 
 
+def test_keyframes_that_saw_all_locate_an_image_by_the_part_that_it_shows():
+    """As of a robot one of whose cameras is missing."""
+    whole = learnt(sees_all=True)
+    part = whole.seeing(camera().seen((CONFIG.height, CONFIG.width)))
+    assert whole.seen is None and part.coarse is whole.coarse
+    assert_allclose(part.seen, mask(whole.channels[-1].stop))
+    far, turned_by = errors(part)
+    unaware, _ = errors(whole)
+    assert far < 0.06 and far < 0.5 * unaware
+    assert turned_by < np.deg2rad(0.3)
+
+
 @pytest.mark.parametrize('config', [CONFIG, replace(CONFIG, clockwise=False)])
 def test_images_with_a_hidden_sector_are_located_by_what_was_seen(config):
     far, turned_by = errors(learnt(sees_all=False, config=config), config)

@@ -9,7 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cylinder_worlds import place, visit
+from numpy.testing import assert_array_equal
 from places import lengths
+from rigs import rig
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from sfa_localization import evaluation, training, updating
@@ -23,7 +25,7 @@ from sfa_localization.keyframes.light import Conditions
 from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE
 from sfa_localization.localizer import Localizer
 from sfa_localization.observer import Observer
-from sfa_localization.place_model import FORMAT, VERSION, PlaceModel, camera_of
+from sfa_localization.place_model import FORMAT, VERSION, PlaceModel, camera_of, surround_of
 
 
 @pytest.fixture(scope='module')
@@ -123,6 +125,32 @@ def test_a_model_is_the_same_after_it_was_saved(model, saved, pictures, tmp_path
     assert Localizer(again).filter.correlation.share == pytest.approx(again.error_correlation.share)
     again.save(tmp_path / 'again.npz')
     assert (tmp_path / 'again.npz').read_bytes() == saved.read_bytes()
+
+
+def test_a_model_keeps_several_cameras_and_does_without_one_that_is_missing(
+    model, pictures, tmp_path
+):
+    """Its sector repeats the columns at its edges; a model of one camera takes it for the view."""
+    several = replace(model, surround=tuple(rig()))
+    several.save(tmp_path / 'several.npz')
+    assert (
+        surround_of(tmp_path / 'several.npz')
+        == PlaceModel.load(tmp_path / 'several.npz').surround
+        == tuple(rig())
+    )
+    model.save(tmp_path / 'one.npz')
+    assert surround_of(tmp_path / 'one.npz') == ()
+    blind = Unwrapper(CameraConfig(blind_sectors=(140.0, 220.0)), model.panorama)
+    hidden = np.stack([blind(picture) for picture in pictures])
+    whole = np.array([at.pose for at in model.locate_all(pictures)])
+
+    def off(by):
+        poses = np.array([at.pose for at in by.locate_all(hidden)])
+        return np.median(np.hypot(*(poses - whole)[:, :2].T))
+
+    assert off(several) < 0.6 * off(model)
+    for one, other in zip(several.locate_all(pictures), model.locate_all(pictures), strict=True):
+        assert_array_equal(one.pose, other.pose)  # where nothing is hidden, nothing changes
 
 
 LENS = LensCalibration(

@@ -3,18 +3,27 @@
 """The simulator: geometry of its pictures, routes, errors of sensors, light, season, bags."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
 from places import distances, lengths
+from rosbags.interfaces import QosDurability
+from scipy.spatial.transform import Rotation
 
-from sfa_localization.camera.lenses import make_camera
+from sfa_localization.bags.decoding import decode
+from sfa_localization.bags.reader import Bag
+from sfa_localization.camera.calibration_files import calibration_of_info
+from sfa_localization.camera.lenses import make_camera, turned_camera
 from sfa_localization.camera.leveling import tilted
-from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.panorama import Unwrapper, panorama_rays
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
+from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.geometry import compose, relative, wrap_angle
+from sfa_localization.data.messages import read_stamp
 from sfa_localization.data.run import integrate
 from sfa_localization.simulation import drive as drives
+from sfa_localization.simulation.cameras import simulated_cameras
 from sfa_localization.simulation.drive import START_NS, drive, lights, render_images, simulate
 from sfa_localization.simulation.garden import Garden, panel, rounded
 from sfa_localization.simulation.rendering import Dome, Light, Scene, panorama_view, raw_view
@@ -209,6 +218,135 @@ def test_light_and_season_change_plants_only_and_no_drive(tiny):
         assert changed == (set() if season == 'summer' else plants)
         leaves.append(sum(len(s.faces) for s in garden.shapes if s.plant == 'crown'))
     assert leaves[0] > leaves[1] > 2 * leaves[2] > 0
+
+
+FOUR = SimulationConfig(
+    area=(8.0, 8.0), length=1.0, image_noise=0.0, illumination=0.0, cameras=4, camera_radius=0.0
+)
+
+
+def recorded_cameras(path):
+    """Images of a bag by camera, with stamps, its lens, and rotation (3, 3) and place of its
+    optical frame on base_link, as the messages hold them.
+    """
+    images, lenses, poses = {}, {}, {}
+    with Bag(path) as bag:
+        for topic, _, data in bag.messages({t for t in bag.topics if t[:3] not in ('/od', '/im')}):
+            message, camera = decode(data, topic), topic.name.split('/')[1]
+            if topic.name == '/tf_static':
+                assert qos_is_latched(topic)
+                for part in message.transforms:
+                    t, q = part.transform.translation, part.transform.rotation
+                    turn = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+                    name = part.child_frame_id.removesuffix('_optical_frame')
+                    poses[name] = turn, (t.x, t.y, t.z)
+                    assert part.header.frame_id == 'base_link'
+            elif topic.name.endswith('camera_info'):
+                lenses[camera] = calibration_of_info(message)
+            elif 'image' in topic.name:
+                assert message.header.frame_id == f'{camera}_optical_frame'
+                image = message.data.reshape(message.height, message.width, 3)
+                images.setdefault(camera, []).append((read_stamp(message.header.stamp), image))
+    return images, lenses, poses
+
+
+def qos_is_latched(topic):
+    return [offered.durability for offered in topic.qos] == [QosDurability.TRANSIENT_LOCAL]
+
+
+def seen_by(image, lens, turn, rays):
+    """What an image shows along rays (N, 3) in the robot's axes: colors (N, 3), NaN elsewhere."""
+    pixels = turned_camera(lens, image.shape[:2], turn).project(rays)
+    seen = np.isfinite(pixels[:, 0])
+    columns, rows = np.rint(np.where(seen[:, None], pixels, 0)).astype(int).T
+    return np.where(seen[:, None], image[rows, columns].astype(float), np.nan)
+
+
+@pytest.mark.parametrize(
+    ('settings', 'names'),
+    [
+        ({}, ('front', 'left', 'rear', 'right')),
+        ({'cameras': 2, 'camera_fov': 190.0}, ('front', 'rear')),
+        ({'cameras': 3, 'camera_fov': 140.0}, ('camera0', 'camera1', 'camera2')),
+    ],
+)
+def test_cameras_in_one_place_show_the_panorama_along_their_recorded_axes(
+    tmp_path, tiny, settings, names
+):
+    """Each pixel of the panorama is seen by a camera where its lens and /tf_static say, in the same
+    color but for the size of pixels; and nowhere else.
+    """
+    config = replace(FOUR, images_every=3.0, images_every_turn=180.0, **settings)
+    driven = simulate(config, tmp_path / 'bag')
+    images, lenses, poses = recorded_cameras(tmp_path / 'bag')
+    assert tuple(sorted(images)) == tuple(sorted(names))
+    assert {len(each) for each in images.values()} == {len(driven.image_stamps_ns)}
+    panorama = panorama_of(tiny, driven.image_poses[1], PanoramaConfig()).reshape(-1, 3)
+    rays = panorama_rays(PanoramaConfig()).reshape(-1, 3)
+    shown = np.stack([
+        seen_by(images[name][1][1], lenses[name], poses[name][0], rays) for name in names
+    ])  # fmt: skip
+    ahead = rays[:, 0] > 0.9
+    assert np.isfinite(shown[0, ahead]).all() and np.isnan(shown[0, rays[:, 0] < -0.9]).all()
+    off = np.abs(np.nanmedian(shown, axis=0) - panorama).mean(-1)
+    assert np.isfinite(off).all() and np.median(off) < 3
+    turned = np.roll(panorama.reshape(60, 600, 3), 10, 1).reshape(-1, 3)
+    assert np.median(off) < 0.3 * np.median(np.abs(turned - panorama).mean(-1))
+
+
+def test_cameras_differ_by_place_exposure_and_time_as_asked(tmp_path, tiny):
+    config = replace(
+        FOUR,
+        cameras=2,
+        camera_radius=0.5,
+        camera_size=(64.0, 48.0),
+        camera_exposures=(1.0, 0.5),
+        camera_skew=(0.0, 33.0),
+    )
+    driven = simulate(config, tmp_path / 'bag')
+    images, _, poses = recorded_cameras(tmp_path / 'bag')
+    places = {name: place for name, (_, place) in poses.items()}
+    assert places['front'] == pytest.approx((0.5, 0.0, 0.45), abs=1e-9)
+    assert places['rear'] == pytest.approx((-0.5, 0.0, 0.45), abs=1e-9)
+    stamps = driven.image_stamps_ns
+    assert [stamp for stamp, _ in images['front']] == stamps.tolist()
+    assert [stamp for stamp, _ in images['rear']] == (stamps + 33_000_000).tolist()
+    (_, front), (later, rear) = images['front'][1], images['rear'][1]
+    ahead, behind = simulated_cameras(replace(config, camera_exposures=(), cameras=2))
+    there = driven.truth.at(np.array([stamps[1], later]))
+    expected = (
+        tiny.image(compose(there[0], np.array([0.5, 0.0, 0.0])), ahead.view),
+        tiny.image(compose(there[1], np.array([-0.5, 0.0, 0.0])), behind.view) / 2,
+    )
+    for image, picture in zip((front, rear), expected, strict=True):
+        assert np.abs(image.astype(float) - rounded(picture)).mean() < 0.1
+
+
+@pytest.mark.parametrize(
+    ('settings', 'text'),
+    [
+        ({'camera_skew': (0.0, 1.0)}, 'camera_skew: 2 numbers for 4 cameras'),
+        ({'camera_exposures': (1.0,)}, 'camera_exposures: 1 numbers for 4 cameras'),
+        ({'camera_size': (64.0,)}, 'camera_size: give columns x rows'),
+        ({'images': 'panorama'}, 'leave it or cameras out'),
+    ],
+)
+def test_settings_of_cameras_that_do_not_fit_are_named(tmp_path, settings, text):
+    with pytest.raises(ConfigError, match=text):
+        simulate(replace(FOUR, **settings), tmp_path / 'bag')
+    assert not list(tmp_path.iterdir())
+
+
+def test_uneven_ground_tilts_all_cameras_of_the_robot_alike(tiny):
+    """The tilt is that of the robot, not of the ground below each camera."""
+    config = replace(FOUR, terrain=5.0, camera_size=(64.0, 48.0), length=2.0)
+    recorded = drive(tiny, config)
+    (camera, *_), pose = simulated_cameras(config), recorded.image_poses[0]
+    (image,) = islice(render_images(tiny, recorded, config, camera.view, 0.3j), 1)
+    tilt = drives.roll_and_pitch(pose, config, 0)
+    beside = compose(pose, np.array([0.0, 0.3, 0.0]))
+    picture = rounded(tiny.image(np.append(beside, tilt), camera.view))
+    assert np.abs(image.astype(float) - picture).mean() < 0.1
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])

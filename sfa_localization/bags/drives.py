@@ -4,13 +4,14 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import logging
 import tempfile
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +22,14 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.satellite_fixes import in_plane
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.static_transforms import lever_arm
-from sfa_localization.bags.topic_stream import Stream, by_one_clock
+from sfa_localization.bags.surround_topics import PATIENCE, SurroundStream, topics_like
+from sfa_localization.bags.topic_stream import Item, Stream, Used, by_one_clock
+from sfa_localization.camera.joining import Joined
 from sfa_localization.camera.leveling import LeveledPanoramas, tilts_at
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama
+from sfa_localization.camera.sectors import MountedCamera
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
+from sfa_localization.camera.surround import Surround
 from sfa_localization.camera.watch import FrozenWatch, frozen
 from sfa_localization.data.errors import BagError, DataError, MessageError, ModelError
 from sfa_localization.data.files import replaced_mode
@@ -47,6 +52,7 @@ ODOMETRY_TOLERANCE_S = 0.5
 """An image is used when odometry before and after it is this near (s); poses are not interpolated
 over a longer pause."""
 _SAME_IMAGE_NS = 1_000_000  # stamps of one image differ by less
+_WARM_UP_NS = 3_000_000_000  # of images beside a panorama: exposures and periods are known then
 logger = logging.getLogger(__name__)
 R = TypeVar('R', bound='ReadingRecipe')
 
@@ -58,7 +64,7 @@ class ReadingRecipe:
     Images farther than `odometry_tolerance_s` from odometry are left out (0: images before or after
     all of it), and with `distinct` also repetitions of the previous image. Fixes of a satellite
     receiver count from the `origin`, or the first fix without one. Images are those of the `lens`,
-    where the camera describes no other.
+    where the camera describes no other, or those of several cameras around the robot, `surround`.
     """
 
     topics: TopicNames = field(default_factory=TopicNames)
@@ -69,6 +75,7 @@ class ReadingRecipe:
     distinct: bool = False
     origin: Origin | None = None
     lens: LensCalibration | None = None
+    surround: tuple[MountedCamera, ...] = ()
 
     @property
     def unwrapper(self) -> Unwrapper:
@@ -77,12 +84,17 @@ class ReadingRecipe:
         return Unwrapper(self.camera, self.panorama, lens)
 
 
-def as_live(recipe: R, panorama: PanoramaConfig, lens: LensCalibration | None = None) -> R:
-    """The recipe to read a drive with a model's panorama and lens, as the nodes do: the filter also
-    fuses images far from any odometry.
+def as_live(
+    recipe: R,
+    panorama: PanoramaConfig,
+    lens: LensCalibration | None = None,
+    surround: tuple[MountedCamera, ...] = (),
+) -> R:
+    """The recipe to read a drive with a model's panorama, lens and cameras, as the nodes do: the
+    filter also fuses images far from any odometry.
     """
     topics = replace(recipe.topics, points_topic='')
-    live = replace(recipe, topics=topics, panorama=panorama, lens=lens)
+    live = replace(recipe, topics=topics, panorama=panorama, lens=lens, surround=surround)
     return replace(live, odometry_tolerance_s=0.0)
 
 
@@ -159,13 +171,14 @@ def read_drive(
     """
     recipe = recipe or ReadingRecipe()
     with Bag(path, strict=strict, config=recipe.bag) as bag:
-        name = bag.find('image', recipe.topics.image)
+        images = _images_of(bag, recipe)
         try:
-            stored = _PanoramaFile(Path(cache), recipe, unwrapper_of(bag, name, recipe))
-            streams = {'images': bag.stream(name, stored.panorama)}
+            stored = _PanoramaFile(Path(cache), images, recipe.distinct)
+            streams = images.streams(bag, stored.panorama)
             streams |= _other_streams(bag, recipe, want_truth)
-            _collect(bag, streams, stored, progress)
             wheels = streams['odometry']
+            images.follow(wheels)
+            _collect(bag, streams, stored, progress)
             odometry = bag.to_odometry(wheels, wheels.values)
             for text in by_one_clock(streams):
                 logger.warning('%s: %s', bag.path, text)
@@ -173,13 +186,13 @@ def read_drive(
         except OSError as error:
             raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
         origin, points = _measured(bag, streams, recipe.origin)
-        camera = lever_arm(bag, name, wheels.topic)
+        camera = images.place(bag, wheels.topic)
     for problem in bag.problems:
         logger.warning('%s: %s', path, problem)
     counts = {use: stream.count for use, stream in streams.items()}
     yaw_rate = to_yaw_rate(streams['imu'].values) if 'imu' in streams else None
     truth = to_trajectory(streams['ground_truth'].values) if want_truth else None
-    seen = stored.seen
+    seen = images.seen
     motion = (odometry, yaw_rate, truth)
     return Run(bag.path.name, panoramas, *motion, points, counts, camera, origin, seen)
 
@@ -212,39 +225,126 @@ def unwrapper_of(bag: Bag, topic: str, recipe: ReadingRecipe) -> Unwrapper:
     return Unwrapper(masked, recipe.panorama)
 
 
-class _PanoramaFile:
-    """Makes panoramas of one size, and stores them in a temporary file."""
+class _OneCamera:
+    """The images of one camera of a bag, and their panoramas."""
 
-    def __init__(self, folder: Path, recipe: ReadingRecipe, unwrapper: Unwrapper) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as the run
-        self._unwrap = unwrapper
-        self._watch = FrozenWatch() if recipe.distinct else None
-        self.repeats = 0
-        self._shape: tuple[int, ...] = ()
+    def __init__(self, bag: Bag, recipe: ReadingRecipe) -> None:
+        self._topic = bag.find('image', recipe.topics.image)
+        self.total = bag.topics[self._topic].count
+        self._unwrap = unwrapper_of(bag, self._topic, recipe)
+        self._kept: tuple[int, ...] = ()
         self._size = 0, 0
+
+    def streams(self, bag: Bag, convert: Callable[[Any], Image]) -> dict[str, Stream]:
+        """The stream of panoramas, which `convert` makes of images."""
+        return {'images': bag.stream(self._topic, convert)}
+
+    def follow(self, odometry: Stream) -> None:
+        """Take no part in the odometry."""
+
+    def unused(self, streams: Mapping[str, Stream]) -> None:
+        """Count nothing more than its stream does."""
 
     @property
     def seen(self) -> Mask | None:
         """The pixels (H, W) that the camera sees, if any are hidden."""
         return self._unwrap.seen(self._size)
 
+    def place(self, bag: Bag, odometry_topic: str) -> complex | None:
+        """The place of the camera, ahead + i left, m, if the bag contains it."""
+        return lever_arm(bag, self._topic, odometry_topic)
+
     def panorama(self, image: Image) -> Image:
-        """The panorama of a camera's image. Raises LocalizationError."""
-        if looks_like_panorama(*image.shape[:2]):
-            if not self._shape:
-                self._unwrap = self._unwrap.keeping_size((image.shape[0], image.shape[1]))
-            elif image.shape != self._shape:
-                height, width = self._shape[:2]
-                raise MessageError(f'size is not {width}x{height} like the first image')
+        """The panorama of an image. Raises LocalizationError."""
         size = image.shape[0], image.shape[1]
-        image = self._unwrap(image)
+        if looks_like_panorama(*size):
+            if not self._kept:
+                self._unwrap = self._unwrap.keeping_size(size)
+            elif size != self._kept[:2]:
+                height, width = self._kept[:2]
+                raise MessageError(f'size is not {width}x{height} like the first image')
+        panorama = self._unwrap(image)
         self._size = size
-        if self._watch is not None and not self._watch.add(image):
+        self._kept = self._kept or panorama.shape
+        return panorama
+
+
+class _SeveralCameras:
+    """The images of several cameras of a bag, by their topics, and the panoramas of all."""
+
+    def __init__(self, bag: Bag, recipe: ReadingRecipe, topics: Mapping[str, str]) -> None:
+        camera = recipe.camera
+        self._surround = Surround(recipe.surround, recipe.panorama, camera.blind_sectors, PATIENCE)
+        self._surround.check()
+        self._topics = topics
+        self.total = max(bag.topics[topic].count for topic in topics.values())
+
+    def streams(self, bag: Bag, convert: Callable[[Any], Image]) -> dict[str, Stream]:
+        """The stream of panoramas, and those of the cameras, by their uses."""
+        joined = SurroundStream(bag, self._topics, self._surround, convert)
+        cameras = {f'images of {name}': stream for name, stream in joined.cameras.items()}
+        return {'images': joined.panoramas, **cameras}
+
+    def follow(self, odometry: Stream) -> None:
+        """Correct the different times of images by the turns of the odometry."""
+        odometry.passes = functools.partial(self._turned, odometry)
+
+    def _turned(self, odometry: Stream, item: Item) -> list[Used]:
+        _, twist = item.value
+        if twist is not None:
+            self._surround.add_turn_rate(item.stamp_ns, float(twist[1]))
+        return [(odometry, item.stamp_ns, item.value)]
+
+    def unused(self, streams: Mapping[str, Stream]) -> None:
+        """Count the images of cameras that no panorama shows."""
+        for name, reasons in self._surround.unused.items():
+            if stream := streams.get(f'images of {name}'):
+                stream.used -= sum(reasons.values())
+                for reason, number in reasons.items():
+                    stream.skipped.add(reason, number)
+
+    @property
+    def seen(self) -> Mask | None:
+        """The pixels (H, W) that most panoramas show, if any are hidden."""
+        return self._surround.seen
+
+    def place(self, bag: Bag, odometry_topic: str) -> complex:
+        """The place of the panoramas, ahead + i left, m."""
+        return self._surround.place
+
+    def panorama(self, images: Joined) -> Image:
+        """The panorama of the images of one time. Raises CameraError."""
+        return self._surround.compose(images)
+
+
+def _images_of(bag: Bag, recipe: ReadingRecipe) -> _OneCamera | _SeveralCameras:
+    """The camera of a bag, or its several cameras if the recipe has some. Raises BagError."""
+    named = recipe.topics.image
+    topics = topics_like(bag, named, recipe.surround) if recipe.surround else {}
+    return _SeveralCameras(bag, recipe, topics) if topics else _OneCamera(bag, recipe)
+
+
+class _PanoramaFile:
+    """Makes panoramas of images of a bag, and stores them in a temporary file; `distinct` ones
+    only, where that is wanted.
+    """
+
+    def __init__(self, folder: Path, images: _OneCamera | _SeveralCameras, distinct: bool) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as the run
+        self.images = images
+        self._watch = FrozenWatch() if distinct else None
+        self.repeats = 0
+        self._shape: tuple[int, ...] = ()
+
+    def panorama(self, images: Any) -> Image:
+        """The panorama of an image, or of the images of one time. Raises LocalizationError."""
+        panorama = self.images.panorama(images)
+        if self._watch is not None and not self._watch.add(panorama):
             self.repeats += 1
             raise MessageError('image repeats the one before')
-        self._shape = self._shape or image.shape
-        return image
+        self._shape = panorama.shape
+        return panorama
 
     def add(self, image: Image) -> None:
         """Append a panorama."""
@@ -288,7 +388,7 @@ def _collect(bag: Bag, streams: dict[str, Stream], stored: _PanoramaFile, progre
     frozen camera.
     """
     images = streams['images']
-    total = bag.topics[images.topic].count
+    total = stored.images.total
     with progress_bar(f'read {bag.path.name}', total, visible=progress) as bar:
 
         def keep(image: Image) -> None:
@@ -296,7 +396,8 @@ def _collect(bag: Bag, streams: dict[str, Stream], stored: _PanoramaFile, progre
             bar.update(images.received - bar.n)
 
         images.keep = keep
-        bag.collect(streams.values())
+        bag.collect(stream for stream in streams.values() if stream.topic in bag.topics)
+    stored.images.unused(streams)
     if text := frozen(stored.repeats, stored.repeats + len(images.values)):
         raise BagError(f'{bag.path}: {images.topic}: {text}')
 
@@ -341,11 +442,30 @@ def _leveled(panoramas: Panoramas, imu: Stream, sphere: Sphere) -> Panoramas:
 
 
 def images_at(bag: Path, stamps_ns: Collection[int], recipe: ReadingRecipe) -> dict[int, Image]:
-    """Images (H, W, 3) of a bag, by stamps within a millisecond of theirs. Raises BagError."""
+    """Images (H, W, 3) of a bag, or panoramas of its several cameras, by stamps within a
+    millisecond of theirs. Raises BagError.
+    """
     images: dict[int, Image] = {}
     with Bag(bag, config=recipe.bag) as opened:
-        for stamp_ns, image in opened.images(recipe.topics.image) if stamps_ns else ():
+        for stamp_ns, image in _near(opened, stamps_ns, recipe) if stamps_ns else ():
             images |= {at: image for at in stamps_ns if abs(at - stamp_ns) <= _SAME_IMAGE_NS}
             if len(images) == len(stamps_ns):
                 break
     return images
+
+
+def _near(
+    bag: Bag, stamps_ns: Collection[int], recipe: ReadingRecipe
+) -> Iterator[tuple[int, Image]]:
+    """Stamps and images, or panoramas of several cameras near the given stamps."""
+    images = _images_of(bag, recipe)
+    if isinstance(images, _OneCamera):
+        yield from bag.images(recipe.topics.image)
+        return
+    panoramas, *cameras = images.streams(bag, images.panorama).values()
+    wanted = np.array([*stamps_ns], np.int64)
+    for camera in cameras:
+        camera.wanted = lambda at: bool(np.abs(wanted - at).min() < _WARM_UP_NS)
+    for stream, stamp_ns, image in bag.read(cameras):
+        if stream is panoramas:
+            yield stamp_ns, image

@@ -101,9 +101,7 @@ class Bag:
         wanted = KINDS[kind]
         if topic:
             return self._named(wanted, topic)
-        topics = [t for t in self.topics.values() if t.kind in wanted.usual and t.count]
-        topics = [t for t in topics if not PUBLISHED.search(t.name)] or topics
-        topics = [t for t in topics if t.kind not in decoding.VIDEOS] or topics
+        topics = self.candidates(kind)
         if not topics:
             kinds = _short(wanted.usual, ' or ')
             has = self._contents(wanted)
@@ -113,6 +111,13 @@ class Bag:
             raise BagError(f'{self.path}: several topics have {wanted.title}: {names}; '
                            f'choose one with {wanted.flag}')  # fmt: skip
         return self._readable(topics[0])
+
+    def candidates(self, kind: str) -> list[Topic]:
+        """The topics among which that of a `kind` (a key of KINDS) is found."""
+        usual = KINDS[kind].usual
+        topics = [t for t in self.topics.values() if t.kind in usual and t.count]
+        topics = [t for t in topics if not PUBLISHED.search(t.name)] or topics
+        return [t for t in topics if t.kind not in decoding.VIDEOS] or topics
 
     def has(self, kind: str, topic: str = '') -> bool:
         """Whether the topic of a `kind` is named, or one of its usual types has messages."""
@@ -217,6 +222,7 @@ class Bag:
             if stream.images:
                 yield from stream.take(stream.images.finish(), receive_ns)
             yield from stream.flush()
+            yield from stream.ends()
             self._check_complete(stream)
 
     def collect(self, streams: Iterable[Stream]) -> None:

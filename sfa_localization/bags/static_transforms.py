@@ -4,10 +4,36 @@
 
 from __future__ import annotations
 
+import contextlib
+from typing import Any
+
 from sfa_localization.bags import decoding
 from sfa_localization.bags.reader import Bag
 from sfa_localization.data.errors import MessageError
-from sfa_localization.data.static_frames import TOPIC, StaticFrames
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.transforms import TOPIC, TransformTree
+
+
+class Frames:
+    """Frames of a bag: the frame of each topic in its messages, and the tree of /tf_static."""
+
+    def __init__(self) -> None:
+        self.of_topic = dict[str, str]()
+        self._tree = TransformTree()
+        self.transforms = 0
+
+    def add(self, topic: str, message: Any) -> None:
+        """Take a message. Raises MessageError for transforms that are none."""
+        if topic == TOPIC:
+            self._tree.add(message)
+            self.transforms += 1
+            return
+        frame = getattr(message, 'child_frame_id', message.header.frame_id)
+        self.of_topic[topic] = frame.lstrip('/')
+
+    def pose(self, sensor: str, base: str) -> Array | None:
+        """The pose (4, 4) of one frame in another; None where transforms do not connect them."""
+        return self._tree.pose(sensor, base)
 
 
 def lever_arm(bag: Bag, sensor_topic: str, odometry_topic: str) -> complex | None:
@@ -15,22 +41,15 @@ def lever_arm(bag: Bag, sensor_topic: str, odometry_topic: str) -> complex | Non
     topic = bag.topics.get(TOPIC)
     if topic is None or not decoding.can_decode(topic):
         return None
-    frames = dict[str, str]()
-    tree = StaticFrames()
-    transforms = 0
+    frames = Frames()
     for record, _, data in bag.messages({TOPIC, sensor_topic, odometry_topic}):
-        if record.name in frames and record.name != TOPIC:
+        if record.name in frames.of_topic and record.name != TOPIC:
             continue
-        try:
-            message = decoding.decode(data, record)
-            if record.name == TOPIC:
-                tree.add(message)
-                transforms += 1
-            else:
-                frame = getattr(message, 'child_frame_id', message.header.frame_id)
-                frames[record.name] = frame
-        except (MessageError, AttributeError):  # a topic without frames
-            continue
-        if len(frames) == 2 and transforms >= topic.count:
+        with contextlib.suppress(MessageError, AttributeError):  # a topic without frames
+            frames.add(record.name, decoding.decode(data, record))
+        if len(frames.of_topic) == 2 and frames.transforms >= topic.count:
             break
-    return tree.lever(frames[sensor_topic], frames[odometry_topic]) if len(frames) == 2 else None
+    if len(frames.of_topic) < 2:
+        return None
+    pose = frames.pose(frames.of_topic[sensor_topic], frames.of_topic[odometry_topic])
+    return None if pose is None else complex(*pose[:2, 3])

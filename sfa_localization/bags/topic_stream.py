@@ -50,7 +50,8 @@ class Stream:
     `convert` makes a value of a message, of its transform to `frame`, or of an image of a `wanted`
     stamp that `images` reads. Messages of an opaque stream are not decoded: their value is None.
     `strict` raises for a faulty message; a `required` stream must have a usable message. A stream
-    that is collected has `values`, of used messages by stamp: what `keep` returns of them.
+    that is collected has `values`, of used messages by stamp: what `keep` returns of them. A used
+    message becomes what `passes` returns, by default itself; the end of the topic what `ends` does.
 
     Messages pass in increasing order of stamp, each when the next one has come. A single stamp that
     is ahead of the next is skipped, as is a jump that the next does not continue; a lasting jump is
@@ -65,6 +66,8 @@ class Stream:
     images: ImageReader | None = None
     wanted: Callable[[int], bool] = lambda stamp_ns: True
     keep: Callable[[Any], Any] = lambda value: value
+    passes: Callable[[Item], Iterable[Used]] | None = None
+    ends: Callable[[], Iterable[Used]] = list
     required: bool = True
     opaque: bool = False
     received: int = 0
@@ -141,6 +144,8 @@ class Stream:
         self._last = waiting
         self._ahead_ns.append(waiting.stamp_ns - waiting.receive_ns)
         self.used += 1
+        if self.passes is not None:
+            return list(self.passes(waiting))
         return [(self, waiting.stamp_ns, waiting.value)]
 
 

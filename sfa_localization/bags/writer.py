@@ -4,25 +4,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from rosbags.interfaces import Connection, Nodetype
+from rosbags.interfaces import (
+    Connection,
+    Nodetype,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores
 from rosbags.typesys.store import Typestore
 
 from sfa_localization.bags.decoding import typestore
 from sfa_localization.camera.encodings import encode_jpeg, encode_png
+from sfa_localization.camera.sectors import MountedCamera
+from sfa_localization.camera.settings import LensCalibration
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
 STORAGES = ('mcap', 'sqlite3')
+_NEVER = QosTime(2147483647, 4294967295)  # as ROS writes that a time is not limited
+LATCHED = Qos(
+    QosHistory.KEEP_LAST,
+    1,
+    QosReliability.RELIABLE,
+    QosDurability.TRANSIENT_LOCAL,
+    _NEVER,
+    _NEVER,
+    QosLiveliness.AUTOMATIC,
+    _NEVER,
+    avoid_ros_namespace_conventions=False,
+)
+"""Late subscribers receive the last message, as of /tf_static."""
 
 
 class BagWriter:
@@ -119,12 +143,46 @@ class BagWriter:
         _place(message.pose, pose)
         self.message(topic, stamp_ns, message)
 
-    def message(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Write any message of the rosbags type store, received at `stamp_ns`."""
+    def camera_info(self, topic: str, stamp_ns: int, lens: LensCalibration, frame_id: str) -> None:
+        """Write the calibration of a pinhole camera or a fisheye."""
+        message = self._stamped('sensor_msgs/msg/CameraInfo', stamp_ns, frame_id)
+        message.width = lens.image_width
+        message.height = lens.image_height
+        is_fisheye = lens.camera_model == 'fisheye'
+        message.distortion_model = 'equidistant' if is_fisheye else 'plumb_bob'
+        message.d = np.zeros(4 if is_fisheye else 5)
+        message.d[: len(lens.distortion)] = lens.distortion
+        matrix = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
+        message.k = matrix.ravel()
+        message.r = np.eye(3).ravel()
+        message.p = np.column_stack([matrix, np.zeros(3)]).ravel()
+        self.message(topic, stamp_ns, message)
+
+    def static_transforms(
+        self, stamp_ns: int, parent: str, cameras: Mapping[str, MountedCamera]
+    ) -> None:
+        """Write, latched, the transforms from the optical frames of cameras to their `parent`."""
+        message = blank(self._types, 'tf2_msgs/msg/TFMessage')
+        for frame, camera in cameras.items():
+            part = self._stamped('geometry_msgs/msg/TransformStamped', stamp_ns, parent)
+            part.child_frame_id = frame
+            moved = part.transform.translation
+            turned = part.transform.rotation
+            moved.x, moved.y, moved.z = camera.place
+            turned.x, turned.y, turned.z, turned.w = _quaternion(np.array(camera.rotation))
+            message.transforms.append(part)
+        self.message('/tf_static', stamp_ns, message, LATCHED)
+
+    def message(self, topic: str, stamp_ns: int, message: Any, *qos: Qos) -> None:
+        """Write any message of the rosbags type store, received at `stamp_ns`; `qos` is what its
+        publisher offered.
+        """
         kind = message.__msgtype__
         connection = self._connections.get(topic)
         if connection is None:
-            connection = self._writer.add_connection(topic, kind, typestore=self._types)
+            connection = self._writer.add_connection(
+                topic, kind, typestore=self._types, offered_qos_profiles=qos
+            )
             self._connections[topic] = connection
         if connection.msgtype != kind:
             raise BagError(f'{self.path}: topic {topic} is {connection.msgtype}, not {kind}')
@@ -161,3 +219,16 @@ def _place(pose: Any, values: Array) -> None:
     pose.position.y = y
     pose.orientation.z = float(np.sin(yaw_rad / 2))
     pose.orientation.w = float(np.cos(yaw_rad / 2))
+
+
+def _quaternion(rotation: Array) -> list[float]:
+    """The unit quaternion x, y, z, w of a rotation (3, 3).
+
+    It is the eigenvector of the largest eigenvalue: I. Bar-Itzhack, JGCD 23(6), 2000.
+    """
+    off = rotation - rotation.T
+    form = np.zeros((4, 4))
+    form[:3, :3] = rotation + rotation.T - np.trace(rotation) * np.eye(3)
+    form[:3, 3] = form[3, :3] = off[2, 1], off[0, 2], off[1, 0]
+    form[3, 3] = np.trace(rotation)
+    return list(map(float, np.linalg.eigh(form)[1][:, -1]))

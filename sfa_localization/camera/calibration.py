@@ -21,6 +21,7 @@ from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper, panorama_rays
 from sfa_localization.camera.point_tracks import mean_and_change
 from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
+from sfa_localization.camera.surround import Surround
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.files import first_bytes
 from sfa_localization.data.geometry import Array, Complex, Mask
@@ -269,6 +270,8 @@ _GREEN = (80, 220, 80)
 _RED = (60, 60, 255)
 _YELLOW = (60, 230, 250)
 _CHECK_WIDTH = 1200  # px: the labels of a panorama of this width can be read
+_CHECK_HEIGHT = 200  # of the panorama of several cameras
+_NAMES_DEG = 5.0  # elevation of their names
 _SIDES = {'FRONT': 0, 'LEFT': 90, 'BACK': 180, 'RIGHT': 270}
 _LOWEST_LABEL = -20  # degrees: lower ones would cover each other in a mirror
 _LABELS_DEG = 45  # azimuth of the labels of elevations
@@ -295,6 +298,24 @@ def check_image(image: Image, unwrapper: Unwrapper) -> Image:
     framed[:height, margin : margin + width] = raw
     framed[height:] = strip
     return framed
+
+
+def check_surround(panorama: Image, around: Surround) -> Image:
+    """A panorama (H, W, 3) of several cameras, enlarged, with directions, elevations, the seams
+    between cameras and their names.
+    """
+    size = around.panorama
+    larger = dataclasses.replace(size, width=_CHECK_WIDTH, height=_CHECK_HEIGHT)
+    canvas = np.asarray(cv2.resize(panorama, (larger.width, larger.height)), np.uint8)
+    rays = panorama_rays(larger)
+    _draw(canvas, rays, larger)
+    owners = np.asarray(around.owners, np.int16)
+    seams = cv2.morphologyEx(owners, cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8))
+    seams = cv2.resize(seams, (larger.width, larger.height), interpolation=cv2.INTER_NEAREST)
+    canvas[seams > 0] = _YELLOW
+    for camera in around.cameras:
+        _write(canvas, camera.name, rays, (math.degrees(camera.yaw), _NAMES_DEG), _YELLOW)
+    return canvas
 
 
 def _resized(image: Any, width: int) -> Any:

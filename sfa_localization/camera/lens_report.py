@@ -59,14 +59,16 @@ def advice(lens: LearnedLens) -> list[str]:
     ]
 
 
-def fitting_panorama(panorama: PanoramaConfig, lens: LearnedLens) -> PanoramaConfig:
-    """The panorama with the elevations that the lens sees, unless others than usual are asked."""
+def fitting_panorama(panorama: PanoramaConfig, sees: tuple[float, float]) -> PanoramaConfig:
+    """The panorama with elevations between those that are seen, unless others than usual are asked;
+    all are degrees.
+    """
     usual = PanoramaConfig()
     edges = panorama.elevation_min, panorama.elevation_max
     if edges != (usual.elevation_min, usual.elevation_max):
         return panorama
-    lowest = lens.sees[0] + _MARGIN_DEG
-    highest = lens.sees[1] - _MARGIN_DEG
+    lowest = sees[0] + _MARGIN_DEG
+    highest = sees[1] - _MARGIN_DEG
     low = max(usual.elevation_min, lowest)
     high = min(low + usual.elevation_max - usual.elevation_min, highest)
     low = max(lowest, min(low, high - usual.elevation_max + usual.elevation_min))

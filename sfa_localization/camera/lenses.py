@@ -244,6 +244,8 @@ _AXES = {  # columns: directions of the image's right, bottom and center
     'up': np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
     'forward': np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
 }
+OPTICAL_AXES = _AXES['forward']
+"""The axes of an optical frame (REP 103) on a robot that looks ahead."""
 _BACK = np.diag([-1.0, -1.0, 1.0])  # the axes of a camera that looks back, x forward
 _USUAL_AXIS = {'mirror': 'down', 'polar': 'down', 'fisheye': 'up', 'ocam': 'up'}
 _ASPECT_TOLERANCE = 0.02  # between image and calibration, for rounded sizes
@@ -262,14 +264,26 @@ def make_camera(
     """
     if min(size) < 1:
         raise CameraError(f'an image of {size[1]} x {size[0]} pixels is empty')
-    lens = _make_lens(calibration, size, panorama or PanoramaConfig())
     axis = calibration.axis
     if axis == 'auto' or calibration.camera_model in UNCALIBRATED:
         axis = _USUAL_AXIS.get(calibration.camera_model, 'forward')
+    to_robot = rotation(*np.radians(mount_rpy)) @ _AXES[axis]
+    return turned_camera(calibration, size, to_robot, panorama)
+
+
+def turned_camera(
+    calibration: LensCalibration,
+    size: tuple[int, int],
+    to_robot: Array,
+    panorama: PanoramaConfig | None = None,
+) -> CameraModel:
+    """Build the camera whose optical axes (x along columns, y along rows, z into the scene, as of
+    REP 103) `to_robot` (3, 3) turns to the robot's. Raises CameraError as `make_camera`.
+    """
+    lens = _make_lens(calibration, size, panorama or PanoramaConfig())
     reversal = np.diag([-1.0 if calibration.is_mirrored else 1.0, 1.0, 1.0])
-    to_robot = rotation(*np.radians(mount_rpy)) @ _AXES[axis] @ reversal
     radii = (calibration.radius_min, calibration.radius_max)
-    return CameraModel(lens, to_robot, size, _scale(calibration, size), radii)
+    return CameraModel(lens, to_robot @ reversal, size, _scale(calibration, size), radii)
 
 
 def _scale(calibration: LensCalibration, size: tuple[int, int]) -> Array:

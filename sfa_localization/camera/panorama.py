@@ -25,6 +25,7 @@ from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.run import Image
 
 _ASPECT = 3.5  # an image wider than this times its height is a panorama
+_SAME_LEVELS = 2  # of gray, between repeated columns in a JPEG
 _ANY_PANORAMA = 1, 4  # rows, columns
 
 
@@ -188,7 +189,7 @@ def build_tables(
     wraps = calibration.camera_model in UNCALIBRATED  # its columns close on themselves
     if wraps:  # beyond its upper and lower edge, as leveling does, these are repeated
         pixels = model.lens.project(rays @ model.rotation)
-    hidden = _in_sectors(rays, camera.blind_sectors)
+    hidden = hidden_sectors(rays, camera.blind_sectors)
     if camera.mask_file:
         hidden |= _masked(read_mask(camera.mask_file, size), pixels)
     visible &= ~hidden
@@ -210,7 +211,7 @@ def _masked(mask: Mask, pixels: Array) -> Mask:
     return np.asarray(~mask[nearest[..., 1], nearest[..., 0]])
 
 
-def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
+def hidden_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
     """Mask (H, W) of the rays whose azimuth is in a sector from start to end, degrees.
 
     A sector whose end meets its start, as from -180 to 180, is the whole circle.
@@ -248,6 +249,14 @@ def repeated_pixels(visible: Mask) -> Indices:
     """The visible pixel, row by row, that each pixel of `visible` (H, W) repeats."""
     rows, columns = nearest_visible(visible)
     return np.asarray(rows * visible.shape[1] + columns)
+
+
+def repeated_columns(panorama: Image) -> NDArray[np.bool_]:
+    """Which columns (W,) of a panorama (H, W, 3) repeat one beside them, as hidden ones do, also
+    after it was compressed.
+    """
+    after = cv2.absdiff(panorama, np.roll(panorama, -1, axis=1)).max(axis=(0, 2)) <= _SAME_LEVELS
+    return np.asarray(after | np.roll(after, 1))
 
 
 def nearest_visible(visible: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

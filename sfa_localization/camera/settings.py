@@ -157,6 +157,37 @@ class CameraConfig(Settings):
         return self.calibration_file.rpartition('/')[2] or f'camera_model {self.camera_model}'
 
 
+@dataclass(frozen=True, slots=True)
+class SurroundConfig(Settings):
+    """Several cameras around the robot, whose images make one panorama."""
+
+    cameras: tuple[str, ...] = setting(
+        (),
+        'names of 2 to 8 cameras: images on NAME/image_raw, lenses by NAME/camera_info, places by '
+        '/tf_static; empty: those of the model, or one camera',
+        texts=True,
+    )
+    camera_files: tuple[str, ...] = setting(
+        (), 'calibration file of each of the cameras; empty: NAME/camera_info', texts=True
+    )
+    camera_poses: tuple[float, ...] = setting(
+        (),
+        'place ahead, left and up (m), roll, pitch and yaw (deg) of each of the cameras on the '
+        'robot, six numbers a camera; with angles of 0 it looks ahead; empty: /tf_static',
+        low=-360.0,
+        high=360.0,
+    )
+
+    def __post_init__(self) -> None:
+        Settings.__post_init__(self)
+        count = len(self.cameras)
+        if len(self.camera_files) not in (0, count):
+            raise ConfigError(f'camera_files: {len(self.camera_files)} for {count} cameras')
+        if len(self.camera_poses) not in (0, 6 * count):
+            numbers = len(self.camera_poses)
+            raise ConfigError(f'camera_poses: {numbers} numbers; give six for each camera')
+
+
 def require_angles(name: str, angles: tuple[float, ...]) -> None:
     """Raise ConfigError unless there are three angles."""
     if len(angles) != 3:

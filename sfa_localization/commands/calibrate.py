@@ -20,6 +20,7 @@ from sfa_localization.data.files import require_outputs, write_bytes
 from sfa_localization.data.run import Image
 
 if TYPE_CHECKING:
+    from sfa_localization.bags.drives import ReadingRecipe
     from sfa_localization.camera.learned_lens import LearnedLens
 
 WRITES = 'with --output a calibration file, with --check an image; else nothing'
@@ -31,9 +32,9 @@ EXAMPLES = """\
 
 The lens of a drive is learned from its images and odometry, as `train` does by itself: this command
 is for other programs, and to look at it. The check image marks FRONT, LEFT, BACK and RIGHT of the
-robot, and below, in the panorama, the horizon. Correct a file of another tool with --mount-rpy
-(ROLLxPITCHxYAW, as 0x0x90), --axis and --mirrored. omnicam_node reads a file by its parameter
-calibration_file.
+robot, and below, in the panorama, the horizon; of several cameras, the seams of their panorama.
+Correct a file of another tool with --mount-rpy (ROLLxPITCHxYAW, as 0x0x90), --axis and --mirrored.
+omnicam_node reads a file by its parameter calibration_file.
 
 models: mirror (Kalibr omni-radtan, OpenCV omnidir, camodocal MEI; of a fisheye with --mirrored no
 --axis up), fisheye (Kalibr pinhole-equi, OpenCV and ROS fisheye), ocam (OCamCalib
@@ -76,6 +77,8 @@ def run(arguments: argparse.Namespace) -> int:
         calibration.require_replaceable(arguments.output)
     if arguments.check:
         options.require_kind(arguments.check, '.png')
+    if around := _several(arguments):
+        return _check_several(arguments, around)
     lens, learned = _lens(arguments)
     mount_rpy = options.settings(CameraConfig, arguments).mount_rpy
     if any(mount_rpy):
@@ -83,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     text = calibration_files.calibration_text(lens)
     images = _images(arguments)
     if images:
-        panorama = fitting_panorama(PanoramaConfig(), learned) if learned else PanoramaConfig()
+        panorama = fitting_panorama(PanoramaConfig(), learned.sees) if learned else PanoramaConfig()
         # Also without --check, to prove that the calibration is usable.
         check = calibration.check_image(images[0], Unwrapper(CameraConfig(), panorama, lens))
         if arguments.check:
@@ -93,6 +96,43 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.output:
         write_bytes(arguments.output, text.encode(), CameraError)
     print(text, end='')
+    return 0
+
+
+def _several(arguments: argparse.Namespace) -> ReadingRecipe | None:
+    """The recipe for a bag of several cameras that make a panorama; None for other inputs."""
+    from sfa_localization.bags.drives import ReadingRecipe
+    from sfa_localization.bags.surround_drive import with_cameras
+
+    bags = [path for path in arguments.images if _is_bag(path)]
+    if arguments.calibration or len(bags) != 1:
+        return None
+    recipe = ReadingRecipe(topics=options.settings(TopicNames, arguments))
+    recipe = with_cameras(bags[0], recipe)
+    return recipe if recipe.surround else None
+
+
+def _check_several(arguments: argparse.Namespace, recipe: ReadingRecipe) -> int:
+    """Print how several cameras look, and draw their panorama with its seams."""
+    from sfa_localization.bags.surround_drive import first_panorama, yaws_of
+    from sfa_localization.camera.calibration import check_surround
+    from sfa_localization.camera.encodings import encode_png
+    from sfa_localization.camera.surround import sentence
+
+    if arguments.output:
+        raise LocalizationError(
+            '--output: several cameras have their lenses in camera_info, and the model keeps them: '
+            'give only --check'
+        )
+    (bag,) = arguments.images
+    yaws = yaws_of(bag, recipe, progress=True)
+    recipe = replace(recipe, surround=yaws.corrected(recipe.surround))
+    image = check_surround(*first_panorama(bag, recipe))
+    if arguments.check:
+        write_bytes(arguments.check, encode_png(image), CameraError)
+    print(sentence(recipe.surround))
+    for text in yaws.sentences():
+        print(f'{text} of what /tf_static says')
     return 0
 
 

@@ -8,6 +8,7 @@ import argparse
 import json
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from sfa_localization.fusion.settings import FilterConfig
 
 if TYPE_CHECKING:
     from sfa_localization.evaluation import Evaluation
+    from sfa_localization.place_model import PlaceModel
 
 logger = logging.getLogger(__name__)
 WRITES = """\
@@ -102,12 +104,12 @@ def run(arguments: argparse.Namespace) -> int:
     print(tables(result.scores), *trust_lines(result.scores), sep='\n')
     print(*count_lines(result.counts), sep='\n')
     print(f'aligned on {result.aligned_on}', *result.corrections, sep='\n')
-    _write_files(arguments, result, warnings)
+    _write_files(arguments, model, result, warnings)
     return 0
 
 
 def _write_files(
-    arguments: argparse.Namespace, result: Evaluation, warnings: Sequence[str]
+    arguments: argparse.Namespace, model: PlaceModel, result: Evaluation, warnings: Sequence[str]
 ) -> None:
     """Write what was asked for, the report last."""
     from sfa_localization.filtering import write_trajectory
@@ -119,7 +121,7 @@ def _write_files(
     for name, path in {'truth': result.truth, **result.estimates}.items() if arguments.tum else ():
         write_trajectory(path, arguments.tum / f'{name}.tum')
     if arguments.report:
-        _write_report(arguments, result, warnings)
+        _write_report(arguments, model, result, warnings)
 
 
 def _compare(arguments: argparse.Namespace) -> int:
@@ -153,7 +155,7 @@ def _results(file: Path) -> dict[str, Any]:
 
 
 def _write_report(
-    arguments: argparse.Namespace, result: Evaluation, warnings: Sequence[str]
+    arguments: argparse.Namespace, model: PlaceModel, result: Evaluation, warnings: Sequence[str]
 ) -> None:
     """Write figures and the page; the worst images are read from the bag again."""
     from sfa_localization.bags.drives import images_at
@@ -167,7 +169,9 @@ def _write_report(
     late_ns = round(result.counts.get('camera_delay_s', 0.0) * 1e9)
     worst = worst_of(result.truth, result.estimates['sfa'])
     stamps = {image: stamp + late_ns for image, stamp in worst.items()}
-    read = images_at(arguments.bag, stamps.values(), options.recipe(arguments))
+    recipe = options.recipe(arguments)
+    recipe = replace(recipe, panorama=model.panorama, surround=model.surround)
+    read = images_at(arguments.bag, stamps.values(), recipe)
     samples = {image: read[stamp] for image, stamp in stamps.items() if stamp in read}
     title = f'{arguments.model.name} on {arguments.bag.name}'
     notes = f'The map is aligned on {result.aligned_on}.', *result.corrections, *warnings

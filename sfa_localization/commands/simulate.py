@@ -16,6 +16,8 @@ WRITES = 'a bag with images, odometry, turn rates and the ground truth'
 EXAMPLES = """\
   simulate bags/coverage --trajectory coverage --seed 1
   simulate bags/test --trajectory test --seed 2 --compression jpeg
+  simulate bags/around --cameras 4 --camera-fov 100 --camera-radius 0.2 --compression jpeg
+  simulate bags/two_fisheyes --cameras 2 --camera-fov 190 --camera-radius 0.1
   simulate bags/tiny --area 8x8 --length 30 --images panorama --size 300x30"""
 
 

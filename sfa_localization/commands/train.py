@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -154,8 +155,10 @@ def _write_report(
     folder = arguments.report
     bags = arguments.bags
     worst = worst_of(trained)
+    model = trained.model
+    around = replace(used, panorama=model.panorama, surround=model.surround)
     read = [
-        images_at(bag, [stamp for run, stamp in worst.values() if run == number], used)
+        images_at(bag, [stamp for run, stamp in worst.values() if run == number], around)
         for number, bag in enumerate(bags)
     ]
     samples = {image: read[run][at] for image, (run, at) in worst.items() if at in read[run]}

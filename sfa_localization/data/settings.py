@@ -25,7 +25,7 @@ _FORMS = {
     float: 'a number',
     int: 'a whole number',
     str: 'a text; put it in quotes',
-    tuple: 'a list of numbers, such as [1.0, 2.5]',
+    tuple: 'a list of numbers, such as [1.0, 2.5], or of texts',
 }
 
 
@@ -38,13 +38,17 @@ def setting(
     high: float | None = None,
     choices: tuple[str, ...] = (),
     live: bool = False,
+    texts: bool = False,
 ) -> Any:
     """Declare one parameter: `doc` describes it, [low, high] or `choices` bound it.
 
-    `live` parameters may change while a node runs; the others are read-only after start.
+    `live` parameters may change while a node runs; the others are read-only after start. A list
+    holds numbers, or `texts`.
     """
     metadata = {'doc': doc, 'unit': unit, 'live': live, 'low': low, 'high': high}
-    return dataclasses.field(default=default, metadata={'choices': choices, **metadata})
+    return dataclasses.field(
+        default=default, metadata={'choices': choices, 'texts': texts, **metadata}
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +57,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):
-            value = _converted(item.name, item.default, getattr(self, item.name))
+            entry = '' if item.metadata['texts'] else 0.0
+            value = _converted(item.name, item.default, getattr(self, item.name), entry)
             for number in value if isinstance(value, tuple) else (value,):
                 _check_bounds(item.name, item.metadata, number)
             object.__setattr__(self, item.name, value)
@@ -91,11 +96,12 @@ def nearest(name: str, names: Collection[str]) -> str:
     return f'; did you mean {close[0]!r}?' if close else ''
 
 
-def _converted(where: str, default: Any, value: Any) -> Any:
-    """Accept an int for a float and a list for a tuple; otherwise require the same type."""
+def _converted(where: str, default: Any, value: Any, entry: Any = None) -> Any:
+    """Accept an int for a float and a list for a tuple, whose values are like `entry`; otherwise
+    require the same type.
+    """
     if isinstance(default, tuple) and isinstance(value, (list, tuple)):
-        kind = default[0] if default else 0.0
-        return tuple(_converted(where, kind, entry) for entry in value)
+        return tuple(_converted(where, entry, each) for each in value)
     if isinstance(default, float) and type(value) is int:
         with suppress(OverflowError):  # of an integer beyond all floats
             return float(value)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.keyframes.errors import ErrorModel
-from sfa_localization.keyframes.hidden import completed, masked, turned_mask
+from sfa_localization.keyframes.hidden import completed, masked, seen_in, turned_mask
 from sfa_localization.keyframes.regression import Fit, regress
 from sfa_localization.keyframes.texture import (
     COARSE,
@@ -98,6 +99,14 @@ class Keyframes:
         return dataclasses.replace(
             self, values=self.values[rows], poses=self.poses[rows], lights=self.lights[rows]
         )
+
+    def seeing(self, panorama: Mask) -> Keyframes:
+        """The same for an image that shows only some pixels (H, W) of the panorama."""
+        known = seen_in(panorama, self.channels[-1].stop, self.columns)
+        _ = self.coarse  # so that the copy has it, too
+        changed = copy.copy(self)
+        object.__setattr__(changed, 'seen', known if self.seen is None else known & self.seen)
+        return changed
 
     def spectrum(self, row: int) -> Spectra:
         """The spectrum (rows, F) of the texture of a keyframe."""

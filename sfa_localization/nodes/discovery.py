@@ -42,7 +42,7 @@ class Discovery:
     `arguments` of the launch file choose another topic: the first is the input's. `take` is called
     with the only topic of the first type that qualifies, or else of any, and with this type, unless
     the input was remapped to a topic that is published; and with the input's own topic when
-    somebody publishes on that again.
+    somebody publishes on that again. A `fixed` input takes other transports of its topic only.
     """
 
     def __init__(
@@ -52,6 +52,8 @@ class Discovery:
         types: Sequence[str],
         arguments: Sequence[str],
         take: Callable[[str, str], None] | None = None,
+        *,
+        fixed: bool = False,
     ) -> None:
         self._node = node
         self._topic = topic
@@ -60,6 +62,7 @@ class Discovery:
         self._start_s = steady_s()
         self._expected = node.resolve_topic_name(topic)
         self._take = take
+        self._fixed = fixed or node.is_remapped(topic)
         self._has_substitute = False
         self.hint = ''
         """Which topics there are, while nobody publishes on that of the input."""
@@ -121,7 +124,7 @@ class Discovery:
         """Whether a topic is no output of this package, and in no other robot's namespace. An input
         that is remapped takes the same images by another transport only.
         """
-        if self._node.is_remapped(self._topic):
+        if self._fixed:
             return without_transport(name) == without_transport(self._expected)
         below = self._node.get_namespace().rstrip('/') + '/'
         spaces = {f'{space}/' for _, space in self._node.get_node_names_and_namespaces()}

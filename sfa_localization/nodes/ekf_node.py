@@ -23,6 +23,7 @@ from sfa_localization.data.errors import MessageError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.files import require_outputs
 from sfa_localization.data.geometry import Array, compose, invert
+from sfa_localization.data.rejections import short_line
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.belief import Pose
 from sfa_localization.fusion.pose_filter import Level, PoseFilter, State, Status, Update
@@ -88,6 +89,7 @@ class EkfNode(LocalizationNode):
         self._last_change = 0, 0.0
         self._published_s = 0.0
         self._reliable: State | None = None
+        self._troubles = ''
 
     def setup(self) -> None:
         self._begin()
@@ -108,6 +110,7 @@ class EkfNode(LocalizationNode):
             sensor_qos(20),
         )
         self.subscribe(String, 'sfa/rig', self._receive_rig, latched_qos())
+        self.subscribe(String, 'panorama/troubles', self._receive_troubles, latched_qos())
         for topic in ('initialpose', '~/set_pose'):
             self.subscribe(pose, topic, self._set_pose, QoSProfile(depth=1))
         self.service(Trigger, '~/reset', self._reset)
@@ -203,6 +206,10 @@ class EkfNode(LocalizationNode):
         self.filter.reconfigure(correlation=correlation)
         for line in rig.as_text():
             self.get_logger().info(line)
+
+    def _receive_troubles(self, message: String) -> None:
+        """Take why the panorama lacks some of several cameras; '' if it does not."""
+        self._troubles = short_line(message.data) if message.data else ''
 
     def _set_pose(self, message: geometry.PoseWithCovarianceStamped) -> None:
         if message.header.stamp.sec == 0 and message.header.stamp.nanosec == 0:
@@ -343,7 +350,7 @@ class EkfNode(LocalizationNode):
         if self.filter.odometry_in_turn and self.count_publishers(name) > 1:
             reasons.append(f'two publishers on {name}: stop one, or take another topic by odom:=')
             self.get_logger().warning(reasons[-1], throttle_duration_sec=_LOG_S)
-        reasons += [self.twin] if self.twin else []
+        reasons += [reason for reason in (self._troubles, self.twin) if reason]
         if self._paused:
             reasons.append('paused: images are not fused')
         lost = []

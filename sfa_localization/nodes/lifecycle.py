@@ -26,7 +26,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions, install_signal_handlers
 from std_msgs.msg import Header
 
-from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.data.errors import ConfigError, LocalizationError
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.settings import Settings
@@ -107,8 +106,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def find_files(self, words: Sequence[str]) -> None:
         """Find files that the parameter file names, by the words of the command line."""
-        if parameters.resolve_beside_file(self, self._settings, words):
-            self.settings_changed(self._settings[CameraConfig])
+        for kind in parameters.resolve_beside_file(self, self._settings, words):
+            self.settings_changed(self._settings[kind])
 
     # A node uses these methods.
 

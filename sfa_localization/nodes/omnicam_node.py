@@ -9,7 +9,8 @@ subscribes, and uses only the newest of images that come too fast.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -23,12 +24,15 @@ from sfa_localization.camera.encodings import JPEG_QUALITY
 from sfa_localization.camera.leveling import leveled, tilts_at
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.rim_watch import RimWatch
+from sfa_localization.camera.sectors import MountedCamera
 from sfa_localization.camera.settings import (
     CameraConfig,
     CaptureConfig,
     LensCalibration,
     PanoramaConfig,
+    SurroundConfig,
 )
+from sfa_localization.camera.surround import Surround
 from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.messages import read_stamp, read_tilt
@@ -42,7 +46,8 @@ from sfa_localization.nodes.lifecycle import ERROR, OK, WARN
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import OmnicamNodeConfig
-from sfa_localization.place_model import camera_of
+from sfa_localization.nodes.surround_input import SurroundInput
+from sfa_localization.place_model import camera_of, surround_of
 
 _DEMAND_PERIOD_S = 0.1  # between checks for subscribers: a new one waits no longer for images
 _LITTLE_VISIBLE = 0.5  # a smaller visible share of the panorama gives a warning
@@ -59,7 +64,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
     """
 
     def __init__(self, **options: Any) -> None:
-        groups = [OmnicamNodeConfig, CaptureConfig, CameraConfig, PanoramaConfig]
+        groups = [OmnicamNodeConfig, CaptureConfig, CameraConfig, SurroundConfig, PanoramaConfig]
         super().__init__('omnicam_node', groups, **options)
         self._config = self.settings(OmnicamNodeConfig)
         self._size: tuple[int, int] | None = None
@@ -72,6 +77,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._losses = 0
         self._listening_since_s: float | None = None
         self._images: ImageInput | None = None
+        self.around: SurroundInput | None = None
+        self._told_troubles = ''
         self._calibrations: Any = None
         self._lens: LensCalibration | None = None
         self._trained: PanoramaConfig | None = None
@@ -100,9 +107,12 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self.discovery: Discovery | None = None
         self._substitute = '', ''
         capture = self.settings(CaptureConfig)
-        if capture.source == 'topic':
+        cameras = surround_of(self._config.model) if self._config.model else ()
+        if cameras or self.settings(SurroundConfig).cameras:
+            self._look_around(cameras)
+        elif capture.source == 'topic':
             self.require_input(self._input)
-            self._images = ImageInput(self, transport, self._input, self._publish)
+            self._images = ImageInput(self, transport, self._input, self._unwrap)
             types = self._images.types
             arguments = ('image', 'panorama')
             self.discovery = Discovery(self, self._input, types, arguments, self._take)
@@ -115,6 +125,35 @@ class OmnicamNode(lifecycle.LocalizationNode):
             types = ['sensor_msgs/msg/Imu']
             self._imus = Discovery(self, _IMU, types, ['imu'], self._listen_to_imu)
         self.every(_DEMAND_PERIOD_S, self._follow_demand)
+
+    def _look_around(self, trained: Sequence[MountedCamera]) -> None:
+        """Take images of several cameras. Raises ConfigError where parameters describe one."""
+        camera = self.settings(CameraConfig)
+        usual = CameraConfig(level_by_imu=camera.level_by_imu, blind_sectors=camera.blind_sectors)
+        if camera != usual or self.settings(CaptureConfig).source != 'topic':
+            raise ConfigError(
+                'source, camera_model, calibration_file, mount_rpy and mask_file are for one '
+                'camera, but there are several: leave these parameters out'
+            )
+        latched = lifecycle.latched_qos()
+        self._troubles = self.publisher(String, self.following('panorama/troubles'), latched)
+        self.around = SurroundInput(
+            self,
+            self._config.image_transport,
+            self.settings(SurroundConfig),
+            trained,
+            partial(self._new_surround, self._settings),
+            self._publish_joined,
+        )
+        self._input = next(iter(self.around.topics.values()))
+
+    def _new_surround(self, settings: Current, cameras: Sequence[MountedCamera]) -> Surround:
+        """What makes panoramas of cameras. Raises CameraError."""
+        camera = cast(CameraConfig, settings[CameraConfig])
+        panorama = self._trained or cast(PanoramaConfig, settings[PanoramaConfig])
+        surround = Surround(cameras, panorama, camera.blind_sectors)
+        surround.check()
+        return surround
 
     def _use(self, model: str) -> None:
         """Take panorama and lens from a model. Raises ModelError, and ConfigError for parameters
@@ -160,8 +199,14 @@ class OmnicamNode(lifecycle.LocalizationNode):
             self._report_loss(self._feed.check())
         elif not self._wanted():
             self._stop_listening()
-        elif self._listening_since_s is None and self._images is not None:
+        elif self._listening_since_s is None:
             self._listening_since_s = steady_s()
+            self._start_listening()
+
+    def _start_listening(self) -> None:
+        if self.around is not None:
+            self.around.start()
+        if self._images is not None:
             self._images.start(*self._substitute)
             if self._lens is None and not self.settings(CameraConfig).is_described:
                 take = self._take_calibration
@@ -206,6 +251,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def _stop_listening(self) -> None:
         if self._images is not None:
             self._images.stop()
+        if self.around is not None:
+            self.around.stop()
         self.unsubscribe(self._calibrations)
         self._listening_since_s = self._calibrations = None
 
@@ -225,7 +272,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         stamp_ns, image = delivered
         if stamp_ns <= 0:
             raise MessageError('the clock has not started')
-        self._publish(stamp_ns, image, '')
+        self._unwrap(stamp_ns, image, '')
 
     def _listen_to_imu(self, substitute: str = '', _: str = '') -> None:
         self.unsubscribe(self._imu)
@@ -250,10 +297,27 @@ class OmnicamNode(lifecycle.LocalizationNode):
         sphere = self._panorama.sphere
         return leveled(panorama, tilt, sphere) if self._is_level else panorama
 
-    def _publish(self, stamp_ns: int, image: Image, frame: str) -> None:
-        panorama = self._leveled(self._unwrapper(image), stamp_ns)
-        frame = self._config.frame_id or frame or 'omnicam'
+    def _unwrap(self, stamp_ns: int, image: Image, frame: str) -> None:
+        panorama = self._unwrapper(image)
         self._size = (image.shape[0], image.shape[1])
+        self._publish(stamp_ns, panorama, frame)
+        self._frozen.add(image)
+        if self._rim is not None:
+            self._rim.add(image)
+
+    def _publish_joined(self, stamp_ns: int, panorama: Image) -> None:
+        """Publish a panorama of several cameras, and what it lacks if that has changed."""
+        assert self.around is not None and self.around.surround is not None
+        self._publish(stamp_ns, panorama, '')
+        self._frozen.add(panorama)
+        troubles = '; '.join(self.around.surround.problems)
+        if troubles != self._told_troubles:
+            self._told_troubles = troubles
+            self._troubles.publish(String(data=troubles))
+
+    def _publish(self, stamp_ns: int, panorama: Image, frame: str) -> None:
+        panorama = self._leveled(panorama, stamp_ns)
+        frame = self._config.frame_id or frame or 'omnicam'
         if self.hand_over is not None:
             self.hand_over(stamp_ns, panorama, frame)
         if self._panoramas.get_subscription_count():
@@ -261,15 +325,16 @@ class OmnicamNode(lifecycle.LocalizationNode):
         if self._compressed.get_subscription_count():
             compressed = convert.to_compressed(panorama, stamp_ns, frame, JPEG_QUALITY)
             self._compressed.publish(compressed)
-        self._frozen.add(image)
-        if self._rim is not None:
-            self._rim.add(image)
 
     # Parameters that change while running.
 
     def check(self, settings: Current) -> None:
         """Raises LocalizationError for a mask, sector, mount or elevation that hides all."""
-        if any(settings[kind] != self._settings[kind] for kind in (CameraConfig, PanoramaConfig)):
+        if all(settings[kind] == self._settings[kind] for kind in (CameraConfig, PanoramaConfig)):
+            return
+        if self.around is not None and self.around.surround is not None:
+            self._new_surround(settings, self.around.surround.cameras)
+        else:
             self._new_unwrapper(settings, self._lens).check(self._size)
 
     def settings_changed(self, settings: Settings) -> None:
@@ -277,6 +342,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
             self._feed.config = settings
         elif isinstance(settings, (CameraConfig, PanoramaConfig)):
             self._unwrapper = self._new_unwrapper(self._settings, self._lens)
+            if self.around is not None:
+                self.around.remake()
             if self.active:
                 self._info.publish(convert.to_info(self._panorama))
 
@@ -307,8 +374,11 @@ class OmnicamNode(lifecycle.LocalizationNode):
         if self._listening_since_s is None:
             return OK, 'idle: nobody listens to the panorama'
         listening_s = steady_s() - self._listening_since_s
+        patience_s = self.settings(CaptureConfig).silence_timeout
+        if self.around is not None:
+            return self.around.judge(details, patience_s, listening_s)
         silent_s = min(self.monitors[self._input].silent_for_s(), listening_s)
-        if silent_s > self.settings(CaptureConfig).silence_timeout:
+        if silent_s > patience_s:
             silent = f'no image on {self.full_name(self._input)} for {silent_s:.0f} s'
             return ERROR, (self.discovery and self.discovery.hint) or silent
         return OK, ''
@@ -321,7 +391,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         if monitor.received and not monitor.used:
             return ERROR, 'no image could be used so far'
         visible = 1.0 if self._size is None else self._unwrapper.visible(self._size).mean()
-        details['panorama visible [%]'] = f'{100 * visible:.0f}'
+        details.setdefault('panorama visible [%]', f'{100 * visible:.0f}')
         if visible < _LITTLE_VISIBLE:
             return WARN, f'the camera sees only {100 * visible:.0f} % of the panorama'
         if self._rim is not None and self._rim.problem:

@@ -20,7 +20,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from sfa_localization.camera.settings import CameraConfig
+from sfa_localization.camera.settings import CameraConfig, SurroundConfig
 from sfa_localization.config import (
     given_names,
     ignored_sections,
@@ -33,6 +33,11 @@ from sfa_localization.data.settings import Settings, nearest
 S = TypeVar('S', bound=Settings)
 Current = dict[type[Settings], Settings]
 """The settings in force, by their class."""
+_FILES: dict[type[Settings], str] = {
+    CameraConfig: 'calibration_file',
+    SurroundConfig: 'camera_files',
+}
+"""Parameters that name files, which lie beside the parameter file."""
 _CLOCK = 'use_sim_time'  # a parameter of each node that is not read-only
 
 
@@ -105,6 +110,10 @@ def _typed(item: dataclasses.Field[Any], given: Parameter) -> Parameter:
     value = given.value
     if isinstance(item.default, float) and type(value) is int:
         return Parameter(item.name, value=float(value))
+    if item.metadata['texts']:
+        texts = list(value) if isinstance(value, (list, tuple)) else value
+        is_text = isinstance(texts, list) and all(isinstance(entry, str) for entry in texts)
+        return Parameter(item.name, Parameter.Type.STRING_ARRAY, texts) if is_text else given
     is_list = isinstance(item.default, tuple) and isinstance(value, (list, tuple, array.array))
     if is_list and all(type(entry) in (int, float) for entry in value):
         return Parameter(item.name, Parameter.Type.DOUBLE_ARRAY, [float(x) for x in value])
@@ -139,20 +148,22 @@ def warn_of_arguments(node: Node, words: Sequence[str]) -> None:
         logger.warning(f'unknown parameter {unknown!r}{nearest(unknown, declared)}')
 
 
-def resolve_beside_file(node: Node, current: Current, words: Sequence[str]) -> bool:
-    """Resolve the camera's calibration_file against the folder of the parameter file that names it;
-    False where none does.
+def resolve_beside_file(node: Node, current: Current, words: Sequence[str]) -> list[type[Settings]]:
+    """Resolve calibration files against the folder of the parameter file that names them; return
+    the settings that one names.
     """
-    if CameraConfig not in current:
-        return False
+    return [kind for kind in current.keys() & _FILES.keys() if _resolve(node, current, words, kind)]
+
+
+def _resolve(node: Node, current: Current, words: Sequence[str], kind: type[Settings]) -> bool:
     pairs = [*itertools.pairwise(words)]
-    given = 'calibration_file'
+    given = _FILES[kind]
     if any(flag in ('-p', '--param') and value.startswith(given) for flag, value in pairs):
         return False
     for file in reversed([value for flag, value in pairs if flag == '--params-file']):
         with suppress(ConfigError):  # ROS, which is less strict, has read it
             if given in given_names(file, node.get_fully_qualified_name()):
-                current[CameraConfig] = resolved_beside(current[CameraConfig], file)
+                current[kind] = resolved_beside(current[kind], file)
                 return True
     return False
 

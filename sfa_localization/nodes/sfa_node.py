@@ -28,7 +28,7 @@ from sfa_localization.camera.watch import EXPLAINED_WARNING
 from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
-from sfa_localization.data.static_frames import TOPIC, StaticFrames
+from sfa_localization.data.transforms import TOPIC, TransformTree
 from sfa_localization.fusion.camera_clock import NEAR_NS
 from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.nodes import conversions as convert
@@ -81,7 +81,7 @@ class SfaNode(LocalizationNode):
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
         self._declared: PanoramaConfig | None = None
-        self._frames = StaticFrames()
+        self._frames = TransformTree()
         self._camera_frame = ''
         if TFMessage is not None:
             self.subscribe(TFMessage, TOPIC, self._frames.add, _static_qos())

@@ -374,7 +374,8 @@ def _weak_lines(truth: Trajectory, estimate: Trajectory) -> Iterator[str]:
 def count_lines(counts: Mapping[str, Any]) -> list[str]:
     """Used and skipped inputs, rejections of the filter, seconds in each state, camera delay."""
     lines = []
-    for stream in ('images', 'odometry', 'observations'):
+    cameras = [stream for stream in counts if stream.startswith('images of ')]
+    for stream in ('images', *cameras, 'odometry', 'observations'):
         skipped = sorted(counts[stream]['skipped'].items())
         reasons = ''.join(f'; {n} skipped: {reason}' for reason, n in skipped)
         lines.append(f'{stream}: {counts[stream]["used"]} used{reasons}')

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sfa_localization.camera import surround
 from sfa_localization.camera.lens_report import sentence
 from sfa_localization.inspection import InspectionConfig, too_sparse
 from sfa_localization.motion.sources import MAP
@@ -79,6 +80,8 @@ def _forecast_lines(quality: Mapping[str, Any]) -> list[str]:
 def _drive_lines(trained: Trained) -> list[str]:
     """Lens, rig and measured points, and what was corrected of each drive."""
     lines = []
+    if trained.model.surround:
+        lines.append(surround.sentence(trained.model.surround))
     if trained.lens:
         is_used = trained.lens.calibration == trained.model.lens
         of = 'lens' if is_used else 'lens as the drive shows it, beside the described one in use'

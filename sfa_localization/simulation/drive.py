@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,6 +25,7 @@ from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.progress import progress_over
 from sfa_localization.data.run import Image, Odometry, Stamps, Trajectory, YawRate, integrate
+from sfa_localization.simulation.cameras import SimulatedCamera, simulated_cameras
 from sfa_localization.simulation.garden import Garden, rounded
 from sfa_localization.simulation.rendering import Light, View, panorama_view, raw_view
 from sfa_localization.simulation.routes import ROUTES, Lawn, Motion, Route
@@ -52,6 +53,8 @@ WAVES_M = (1.5, 6.0)
 SWAY = 0.25
 """Random tilt of each image as a share of the slope."""
 RENDERED_AT_ONCE = 16
+Entries = Iterator[tuple[int, Callable[[], None]]]
+"""Stamps of messages in order, and functions that write them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,9 +221,16 @@ def lights(stamps_ns: Stamps, config: SimulationConfig) -> list[Light]:
 
 
 def render_images(
-    garden: Garden, drive: SimulatedDrive, config: SimulationConfig, view: View
+    garden: Garden,
+    drive: SimulatedDrive,
+    config: SimulationConfig,
+    view: View,
+    place: complex = 0j,
+    stream: int = 0,
 ) -> Iterator[Image]:
-    """The noisy images of a drive in order, rendered by a thread per core."""
+    """The noisy images of a drive in order, rendered by a thread per core, from a `place` on the
+    robot, ahead + i left, m; the noise of another `stream` is independent.
+    """
     poses = drive.image_poses
     light = lights(drive.image_stamps_ns, config)
 
@@ -228,8 +238,10 @@ def render_images(
         pose = poses[index]
         if config.terrain:
             pose = np.append(pose, roll_and_pitch(pose, config, index))
+        shift = place * np.exp(1j * pose[2])
+        pose[:2] += shift.real, shift.imag
         image = garden.image(pose, view, light[index])
-        rng = random_stream(config, PIXEL_STREAM, index)
+        rng = random_stream(config, PIXEL_STREAM, index + stream * len(poses))
         noise = rng.standard_normal(image.shape, dtype=np.float32)
         return rounded(image + np.float32(config.image_noise) * noise)
 
@@ -272,31 +284,75 @@ def record(
     lens: LensCalibration | None = None,
 ) -> None:
     """Record a drive to the bag `out`; `progress` shows a bar. Raw images are those of a `lens`, by
-    default of the mirror.
+    default of the mirror; or of the `cameras` of `config`.
 
     Raises BagError when the bag exists or cannot be written, ConfigError for impossible settings.
     After an error or Ctrl-C nothing is left.
     """
-    view = panorama_view(panorama or PanoramaConfig())
-    if config.images == 'raw':
-        lens = lens or LensCalibration()
-        size = lens.image_height, lens.image_width
-        view = raw_view(make_camera(lens, size, mount_rpy=lens.mount_rpy).unproject, size)
+    label = f'render the images of {out.name}'
+    shown = partial(progress_over, desc=label, total=len(driven.image_stamps_ns), visible=progress)
+    cameras = simulated_cameras(config)
     with BagWriter(out, config.storage) as bag:
-        noisy = render_images(garden, driven, config, view)
-        count = len(driven.image_stamps_ns)
-        shown = progress_over(noisy, f'render the images of {out.name}', count, visible=progress)
-        _write(bag, driven, shown, config)
+        if cameras:
+            images = _of_cameras(bag, driven, garden, config, cameras, shown)
+        else:
+            view = _view(config, panorama or PanoramaConfig(), lens or LensCalibration())
+            topic = '/panorama' if config.images == 'panorama' else '/image_raw'
+            frames = shown(render_images(garden, driven, config, view))
+            images = [_images(bag, topic, 'camera', driven.image_stamps_ns, frames, config)]
+        _write(bag, driven, images)
 
 
-def _write(
-    bag: BagWriter, drive: SimulatedDrive, frames: Iterable[Image], config: SimulationConfig
-) -> None:
-    """Write all messages in the order of their stamps."""
+def _view(config: SimulationConfig, panorama: PanoramaConfig, lens: LensCalibration) -> View:
+    """The kind of the images of one camera that sees all around."""
+    if config.images == 'panorama':
+        return panorama_view(panorama)
+    size = lens.image_height, lens.image_width
+    return raw_view(make_camera(lens, size, mount_rpy=lens.mount_rpy).unproject, size)
+
+
+def _of_cameras(
+    bag: BagWriter,
+    drive: SimulatedDrive,
+    garden: Garden,
+    config: SimulationConfig,
+    cameras: Sequence[SimulatedCamera],
+    shown: Callable[[Iterable[Image]], Iterator[Image]],
+) -> list[Entries]:
+    """Transforms, calibrations and images of cameras; `shown` shows the progress of the first."""
+    start_ns = int(drive.truth.stamps_ns[0])
+    poses = {camera.frame: camera.mounted for camera in cameras}
+    transforms = partial(bag.static_transforms, start_ns, 'base_link', poses)
+    entries: list[Entries] = [iter([(start_ns, transforms)])]
+    for number, camera in enumerate(cameras):
+        skewed = replace(drive, image_stamps_ns=drive.image_stamps_ns + camera.skew_ns)
+        stamps_ns = skewed.image_stamps_ns
+        frames = render_images(garden, skewed, config, camera.view, camera.place, number)
+        frames = frames if number else shown(frames)
+        info = partial(bag.camera_info, lens=camera.mounted.lens, frame_id=camera.frame)
+        entries.append(_entries(info, f'/{camera.mounted.name}/camera_info', stamps_ns))
+        topic = f'/{camera.mounted.name}/image_raw'
+        entries.append(_images(bag, topic, camera.frame, stamps_ns, frames, config))
+    return entries
+
+
+def _images(
+    bag: BagWriter,
+    topic: str,
+    frame: str,
+    stamps_ns: Stamps,
+    frames: Iterable[Image],
+    config: SimulationConfig,
+) -> Entries:
+    """The images of a camera, below /compressed where `config` compresses them."""
     compressed = None if config.compression == 'none' else config.compression
-    topic = '/panorama' if config.images == 'panorama' else '/image_raw'
     topic += '/compressed' if compressed else ''
-    image = partial(bag.image, frame_id='camera', compressed=compressed)
+    image = partial(bag.image, frame_id=frame, compressed=compressed)
+    return _entries(image, topic, stamps_ns, frames)
+
+
+def _write(bag: BagWriter, drive: SimulatedDrive, images: Iterable[Entries]) -> None:
+    """Write all messages in the order of their stamps."""
     odometry = drive.odometry
     gyro = drive.yaw_rate
     truth = drive.truth
@@ -305,7 +361,7 @@ def _write(
         _entries(bag.odometry, '/odom', odometry.stamps_ns, *driven),
         _entries(bag.imu, '/imu', gyro.stamps_ns, gyro.omega, gyro.variance) if gyro else (),
         _entries(bag.pose, '/ground_truth', truth.stamps_ns, truth.poses),
-        _entries(image, topic, drive.image_stamps_ns, frames),
+        *images,
         key=lambda entry: entry[0],
     )
     for _, write in entries:
@@ -314,7 +370,7 @@ def _write(
 
 def _entries(
     write: Callable[..., None], topic: str, stamps_ns: Stamps, *columns: Iterable[Any]
-) -> Iterator[tuple[int, Callable[[], None]]]:
+) -> Entries:
     """Stamp of each message of a topic, and a function that writes it."""
     for stamp, *values in zip(map(int, stamps_ns), *columns, strict=True):
         yield stamp, partial(write, topic, stamp, *values)

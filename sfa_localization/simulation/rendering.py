@@ -75,7 +75,8 @@ class Light:
 class Dome:
     """Rays of the camera in the robot's axes: `rays` (rows, columns, 3), x ahead, z up.
 
-    Column c looks toward azimuth -(c + 0.5 - columns / 2) * 2 pi / columns, clockwise.
+    `columns` are those of a whole turn. Those of a grid of elevations and azimuths, which `build`
+    makes, look toward azimuth -(c + 0.5 - columns / 2) * 2 pi / columns, clockwise.
     """
 
     elevations_rad: Array
@@ -146,6 +147,25 @@ def raw_view(unproject: Callable[[Array], Array], size: tuple[int, int]) -> View
         return np.asarray((scene * (1 - cover[..., None]) + hull * cover[..., None]) * gain)
 
     return View(dome, image)
+
+
+def pixel_view(
+    unproject: Callable[[Array], Array], size: tuple[int, int], pixel_rad: float
+) -> View:
+    """The image of a camera that does not see all around: a ray for each pixel, black where
+    `unproject`, as of `raw_view`, sees nothing. `pixel_rad` is the angle of a pixel in the center.
+    """
+    columns, rows = np.meshgrid(np.arange(size[1]), np.arange(size[0]))
+    rays = unproject(np.stack([columns.ravel(), rows.ravel()], -1).astype(float))
+    blind = np.isnan(rays).any(1)
+    rays[blind] = rays[~blind].mean(0)
+    grid = rays.reshape(*size, 3).astype(np.float32)
+    seen = (~blind).reshape(*size, 1)
+
+    def image(dome_image: Floats, gain: Floats) -> Floats:
+        return np.asarray(dome_image * seen * gain, np.float32)
+
+    return View(Dome(np.zeros(size[0]), round(2 * np.pi / pixel_rad), grid), image)
 
 
 def _rows_for(elevation: Array, config: PanoramaConfig) -> Array:

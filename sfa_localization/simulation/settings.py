@@ -38,6 +38,32 @@ class SimulationConfig(Settings):
     images: str = setting(
         'raw', 'image of the mirror, or the panorama itself', choices=('raw', 'panorama')
     )
+    cameras: int = setting(
+        0, 'cameras around the robot, each with its topics, instead of one image', low=0, high=8
+    )
+    camera_fov: float = setting(
+        100.0,
+        'view of each camera across its columns; above 120 degrees it is a fisheye',
+        unit='deg',
+        low=20.0,
+        high=220.0,
+    )
+    camera_radius: float = setting(
+        0.2, 'distance of the cameras from the center of the robot', unit='m', low=0.0, high=2.0
+    )
+    camera_size: tuple[float, ...] = setting(
+        (400.0, 240.0), 'columns and rows of their images', unit='px', low=16.0, high=4096.0
+    )
+    camera_exposures: tuple[float, ...] = setting(
+        (), 'brightness of the images of each camera; empty: equal', low=0.05, high=20.0
+    )
+    camera_skew: tuple[float, ...] = setting(
+        (),
+        'how much later than the others each camera takes its images; empty: not at all',
+        unit='ms',
+        low=-400.0,
+        high=400.0,
+    )
     images_every: float = setting(0.2, 'distance between images', unit='m', low=0.02, high=10.0)
     images_every_turn: float = setting(
         30.0, 'turn on the spot between images', unit='deg', low=1.0, high=360.0

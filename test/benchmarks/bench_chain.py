@@ -3,26 +3,31 @@
 """The three nodes as processes: `python bench_chain.py MODEL.npz BAG [SECONDS]`.
 
 Measures the latency from an image to its pose, the share of a core at 10 and at 30 images a second
-beside 50 odometry messages, and the CPU time and memory of a node until it is active.
+beside 50 odometry messages, the same with several cameras beside one, and the CPU time and memory
+of a node until it is active.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from subprocess import PIPE, STDOUT, TimeoutExpired
 from typing import Any
 
+import cv2
 import numpy as np
 import psutil
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import String
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -30,12 +35,14 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from bench_core import images_and_poses
 from ros_bench import DEADLINE_S, DOMAIN, FRAMES, Spinner, start_process, until
 
+from sfa_localization.camera.encodings import JPEG_QUALITY
+from sfa_localization.camera.settings import LensCalibration
 from sfa_localization.data.messages import read_stamp
-from sfa_localization.nodes.conversions import to_image, to_odometry
+from sfa_localization.nodes.conversions import to_compressed, to_image, to_odometry, to_stamp
 from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.place_model import PlaceModel
 
-ODOMETRY_HZ, IDLE_S = 50.0, 1.0
+ODOMETRY_HZ, RIG_HZ, IDLE_S = 50.0, 10.0, 1.0
 NAMESPACE = '/bench'
 
 
@@ -181,6 +188,85 @@ def bench_nodes(path: Path, bag: Path, seconds: float = 8.0) -> dict[str, float]
         driver.close()
 
 
+class Rig(Driver):
+    """A robot that stands, whose cameras take JPEG images of `size` (columns, rows) at 10 Hz."""
+
+    def __init__(self, topics: list[str], size: tuple[int, int]) -> None:
+        super().__init__()
+        make = self.node.create_publisher
+        self.cameras = [make(CompressedImage, f'{topic}/compressed', 10) for topic in topics]
+        self.taken = []
+        for seed in range(10):
+            noise = np.random.default_rng(seed).integers(0, 256, (30, 40, 3), np.uint8)
+            image = cv2.resize(noise, size, interpolation=cv2.INTER_CUBIC)
+            self.taken.append(to_compressed(image, 1, 'camera', JPEG_QUALITY))
+
+    def stand(self, seconds: float) -> None:
+        """Send in real time."""
+        self.sent.clear()
+        self.latencies_s.clear()
+        start, images, moves = time.perf_counter(), 0, 0
+        while (now := time.perf_counter() - start) < seconds:
+            if now >= moves / ODOMETRY_HZ:
+                self.move(time.time_ns(), np.zeros(3), np.zeros(2))
+                moves += 1
+            elif now >= images / RIG_HZ:
+                message, stamp_ns = self.taken[images % len(self.taken)], time.time_ns()
+                message.header.stamp = to_stamp(stamp_ns)
+                self.sent[stamp_ns] = time.perf_counter()
+                for camera in self.cameras:
+                    camera.publish(message)
+                images += 1
+            else:
+                time.sleep(0.0005)
+        time.sleep(IDLE_S)
+
+
+def bench_rig(
+    path: Path, seconds: float, topics: list[str], size: tuple[int, int]
+) -> tuple[float, float]:
+    """Share of a core, and the 99th percentile of the latency, ms, with the camera of a model."""
+    given = [f'model:={path}']
+    jpeg = [*given, 'image_transport:=compressed']
+    placed = ['initial_pose:=[0.0, 0.0, 0.0]']  # the images are noise, which tells no place
+    rig = Rig(topics, size)
+    try:
+        with running({'omnicam_node': jpeg, 'sfa_node': given, 'ekf_node': placed}) as processes:
+            if not until(lambda: rig.stand(2.0) or rig.latencies_s):
+                raise RuntimeError('the nodes give no pose')
+            before = cpu_s(processes)
+            rig.stand(seconds)
+            share = (cpu_s(processes) - before) / (seconds + IDLE_S)
+            if len(rig.latencies_s) < 0.9 * RIG_HZ * seconds:
+                raise RuntimeError('images are lost: this computer is too busy')
+            return share, float(np.percentile(rig.latencies_s, 99)) * 1e3
+    finally:
+        rig.close()
+
+
+def bench_cameras(path: Path, seconds: float = 8.0) -> dict[str, float]:
+    """Four cameras of 640 x 480 around a robot, over one mirror of 640 x 640."""
+    from sfa_localization.camera.sectors import MountedCamera, optical_pose
+
+    focal = 320 / math.tan(math.radians(50))
+    lens = LensCalibration(image_height=480, fx=focal, fy=focal, cy=239.5, xi=0.0, radius_min=0.0,
+                           radius_max=0.0, mirrored='no')  # fmt: skip
+    names = ['front', 'left', 'rear', 'right']
+    cameras = tuple(
+        MountedCamera.at(name, lens, optical_pose((0.0, 0.0, 0.5), (0.0, 0.0, 90.0 * number)))
+        for number, name in enumerate(names)
+    )
+    model = PlaceModel.load(path)
+    with tempfile.TemporaryDirectory() as folder:
+        one, four = Path(folder) / 'one.npz', Path(folder) / 'four.npz'
+        replace(model, lens=LensCalibration()).save(one)
+        replace(model, lens=None, surround=cameras).save(four)
+        alone, _ = bench_rig(one, seconds, ['image_raw'], (640, 640))
+        topics = [f'{name}/image_raw' for name in names]
+        together, latency_ms = bench_rig(four, seconds, topics, (640, 480))
+    return {'cameras_over_mirror': together / alone, 'cameras_latency_p99_ms': latency_ms}
+
+
 def bench_start(path: Path) -> dict[str, float]:
     """CPU time from exec to active, in s, and the resident memory then, in MiB: the most of all."""
     figures = []
@@ -199,4 +285,7 @@ def bench_start(path: Path) -> dict[str, float]:
 if __name__ == '__main__':
     model_path, bag_path = map(Path, sys.argv[1:3])
     chain = bench_nodes(model_path, bag_path, *map(float, sys.argv[3:4]))
-    print(json.dumps({**chain, **bench_start(model_path)}))
+    several = {}
+    with suppress(ImportError):  # a release before there were several cameras
+        several = bench_cameras(model_path, *map(float, sys.argv[3:4]))
+    print(json.dumps({**chain, **several, **bench_start(model_path)}))

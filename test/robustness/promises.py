@@ -61,6 +61,11 @@ PROMISES = {
         ('wrong images after an outage', 'several must agree along the odometry'),
     'test_sfa_node.py::test_an_unusable_image_gives_no_pose_and_is_reported':
         ('a dark, covered or frozen camera', 'no pose, and the reason'),
+    'test_surround_input.py::test_a_faulty_camera_is_hidden_and_named_until_it_is_back':
+        ('one of several cameras that is dark, frozen or silent',
+         'its sector is hidden; named, after 3 s in a state DEGRADED'),
+    'test_surround_input.py::test_an_image_of_another_camera_is_refused_and_the_others_go_on':
+        ('images of another size from one of several cameras', 'refused; the others go on'),
     'test_keyframes.py::test_what_was_never_seen_is_not_believed':
         ('a place outside of the training', 'images are rejected as unlike those of training'),
     'test_omnicam_node.py::test_a_silent_camera_shows_in_diagnostics':
