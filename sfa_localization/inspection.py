@@ -8,7 +8,7 @@ import contextlib
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,7 +30,7 @@ from sfa_localization.camera.joining import Joined
 from sfa_localization.camera.leveling import leaning
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.camera.sectors import MountedCamera, visible_elevations
-from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import FrozenWatch, frozen
 from sfa_localization.data.errors import BagError, LocalizationError, MessageError
@@ -356,7 +356,9 @@ class _Survey:
         clockwise = recipe.panorama.clockwise
         self._bag = bag
         self._report = report
-        self._unwrap = unwrapper_of(bag, report.image_topic, recipe)
+        # The images of several cameras are panoramas already.
+        described = replace(recipe, camera=CameraConfig()) if cameras else recipe
+        self._unwrap = unwrapper_of(bag, report.image_topic, described)
         self._gyro = VisualGyro(clockwise)
         self._frozen = FrozenWatch()
         self._repeats = 0

@@ -32,7 +32,11 @@ TWINS = {
         r"\.write_(text|bytes)\(|imwrite\(|savetxt\(|mk[ds]temp\(|\.rename\(|NamedTemporaryFile\(|"
         r"fdopen\(|open\([^)]*'[wxa]b?'",
         # A folder that is renamed when whole; temporary folders; standard output.
-        {'data/files.py', 'bags/writer.py', 'bags/files.py', 'commands/live_nodes.py', 'cli.py'},
+        # What is recorded while the robot drives; the log of a process.
+        {
+            'data/files.py', 'bags/writer.py', 'bags/files.py', 'commands/live_nodes.py', 'cli.py',
+            'bags/recorder.py', 'nodes/worker.py',
+        },
     ),
     'a filter for a model': (
         r'(fused|filter)\.expect\(', {'localizer.py', 'nodes/ekf_node.py'},

@@ -335,17 +335,9 @@ class EkfNode(LocalizationNode):
         """The filter's status, with the reasons that the wall clock gives, as silent inputs."""
         self.filter.waited_s = self._waited_s()
         status = self.filter.status
-        reasons = []
         by_now = self._by_now()
-        running_s = steady_s() - self._configured_s
         timeout_s = self._config.silence_timeout
-        for topic, limit in ((_ODOM, timeout_s), (_IMAGE_POSE, IMAGES_SILENCE * timeout_s)):
-            silent = self.monitors[topic].silent_for_s()
-            name = self.full_name(topic)
-            if min(silent, running_s) > limit and not self.count_publishers(name):
-                reasons.append(f'nobody publishes on {name}')
-            elif limit < silent < math.inf:
-                reasons.append(f'nothing on {name} for {silent:.0f} s')
+        reasons = self._silent_inputs(timeout_s)
         name = self.full_name(_ODOM)
         if self.filter.odometry_in_turn and self.count_publishers(name) > 1:
             reasons.append(f'two publishers on {name}: stop one, or take another topic by odom:=')
@@ -363,6 +355,19 @@ class EkfNode(LocalizationNode):
             # The filter knows the stamps of messages only; by the wall clock it may be lost.
             lost = [f'{reason} by now' for reason in uncertainty(by_now, self.filter.config)]
         return status.with_reasons(lost, reasons)
+
+    def _silent_inputs(self, timeout_s: float) -> list[str]:
+        """Which inputs have been silent for longer than this, images for longer, in words."""
+        reasons = []
+        running_s = steady_s() - self._configured_s
+        for topic, limit in ((_ODOM, timeout_s), (_IMAGE_POSE, IMAGES_SILENCE * timeout_s)):
+            silent = self.monitors[topic].silent_for_s()
+            name = self.full_name(topic)
+            if min(silent, running_s) > limit and not self.count_publishers(name):
+                reasons.append(f'nobody publishes on {name}')
+            elif limit < silent < math.inf:
+                reasons.append(f'nothing on {name} for {silent:.0f} s')
+        return reasons
 
     def _behind_s(self) -> float:
         """How long the last odometry waited for this node, s."""
