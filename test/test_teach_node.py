@@ -141,7 +141,7 @@ def test_a_drive_is_taught_and_learned(bench, chain, taught, tmp_path):
     assert until(lambda: any('enough to train on' in each.data for each in said)), taught._said
     assert 0 in grids[-1].data and hints[-1].markers[-1].text.startswith('enough')
     assert call(bench, 'finish').success
-    assert until(lambda: 'is written' in said[-1].data, 300.0), said[-1].data
+    assert until(lambda: 'is written. The map' in said[-1].data, 300.0), said[-1].data
     report = inspect(tmp_path / 'garden_drive1')
     assert report.lacks == [] and report.problems == []
     assert {name: topic.count for name, topic in ((t.name, t) for t in report.topics)} == {
@@ -157,6 +157,8 @@ def test_a_drive_is_taught_and_learned(bench, chain, taught, tmp_path):
     localize(bench, inputs, located)
     assert call(bench, 'extend').success and taught._recorder.folder.name == 'garden_drive2'
     assert call(bench, 'cancel').success
+    assert [*tmp_path.glob('garden_trial2')] and not [*tmp_path.glob('garden_drive2')]
+    assert call(bench, 'extend').success and taught._recorder.folder.name == 'garden_drive3'
 
 
 def localize(bench, inputs, located):
@@ -172,6 +174,11 @@ def localize(bench, inputs, located):
         if located and located[-1].data == 'LOCALISED':
             return
     assert until(lambda: located[-1].data == 'LOCALISED', 5.0), located[-1].data
+
+
+def test_panoramas_are_recorded_unless_this_package_makes_them(bench, taught):
+    bench.publish('/panorama/compressed', CompressedImage())
+    assert until(lambda: '/panorama/compressed' in taught._recorder.counts)
 
 
 def test_a_name_is_needed_and_nothing_is_finished_before_it_began(bench, taught):

@@ -24,10 +24,9 @@ def without_transport(topic: str) -> str:
     return _TRANSPORT.sub('', topic)
 
 
-def is_output(node: Any, name: str) -> bool:
+def is_ours(node: Any, name: str) -> bool:
     """Whether a node of this package publishes a topic, as the other `node` sees it."""
-    ours = {other for other, _ in _publishers(node, name)} & {*NODES, node.get_name()}
-    return bool(ours) or name.endswith(_OUTPUTS)
+    return bool({other for other, _ in _publishers(node, name)} & {*NODES, node.get_name()})
 
 
 def _publishers(node: Any, name: str) -> set[tuple[str, str]]:
@@ -134,7 +133,7 @@ class Discovery:
         return usual and is_image and not self._is_output(name)
 
     def _is_output(self, name: str) -> bool:
-        return is_output(self._node, name)
+        return is_ours(self._node, name) or name.endswith(_OUTPUTS)
 
     def _publishers(self, name: str) -> set[tuple[str, str]]:
         return _publishers(self._node, name)

@@ -9,6 +9,7 @@ process of their own, so that what is said here is what they say of the bag.
 from __future__ import annotations
 
 import importlib
+import itertools
 import json
 from collections.abc import Sequence
 from functools import partial
@@ -33,7 +34,7 @@ from sfa_localization.data.errors import BagError, ConfigError, LocalizationErro
 from sfa_localization.mapping.driven_ground import DrivenGround
 from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.nodes import conversions as convert
-from sfa_localization.nodes.discovery import DEPTH, is_output
+from sfa_localization.nodes.discovery import DEPTH, is_ours
 from sfa_localization.nodes.lifecycle import ERROR, OK, WARN, LocalizationNode, latched_qos
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.process import NODES
@@ -69,12 +70,13 @@ class TeachNode(LocalizationNode):
             raise ConfigError("parameter 'output' is empty: name the model to write, GARDEN.npz")
         self._model = Path(output).expanduser()
         self._folder = TemporaryDirectory(prefix='teach-')
+        self._judgment = Path(self._folder.name) / 'judgment.json'
         self._is_training = False
         self._findings: dict[str, Any] = {}
         self._next_look_s = 0.0
         self._problem = ''
         self._said = ''
-        self._start(self._drives()[-1:] or [self._drive(1)])
+        self._start(*self._pending()[-1:] or [self._new_drive()])
         latched = latched_qos()
         self._state = self.publisher(String, 'teach/state', latched)
         self._map = self.publisher(OccupancyGrid, 'teach/map', latched)
@@ -97,19 +99,28 @@ class TeachNode(LocalizationNode):
 
     # Recording.
 
-    def _drive(self, number: int) -> Path:
-        """The folder of a drive, beside the model."""
-        return self._model.with_name(f'{self._model.stem}_drive{number}')
+    def _new_drive(self) -> Path:
+        """The folder of one more drive, beside the model."""
+        stem = self._model.stem
+        taken = {path.name for path in self._model.parent.glob(f'{stem}_*')}
+        numbers = itertools.count(1)
+        free = next(n for n in numbers if not taken & {f'{stem}_drive{n}', f'{stem}_trial{n}'})
+        return self._model.with_name(f'{stem}_drive{free}')
 
     def _drives(self) -> list[Path]:
         """The folders that are there."""
         folders = self._model.parent.glob(f'{self._model.stem}_drive*')
         return sorted(folders, key=lambda path: (len(path.name), path.name))
 
-    def _start(self, folders: Sequence[Path]) -> None:
-        """Record into the last of the folders."""
-        self._recorder = BagRecorder(folders[-1])
-        self.get_logger().info(f'recording into {folders[-1]}')
+    def _pending(self) -> list[Path]:
+        """The folders that the model has not learned: they are newer."""
+        learned_s = self._model.stat().st_mtime if self._model.exists() else 0.0
+        return [path for path in self._drives() if path.stat().st_mtime > learned_s]
+
+    def _start(self, folder: Path) -> None:
+        """Record into a folder, or go on there."""
+        self._recorder = BagRecorder(folder)
+        self.get_logger().info(f'recording into {folder}')
 
     def _end_recording(self) -> None:
         for subscription in self._recorded.values():
@@ -130,7 +141,7 @@ class TeachNode(LocalizationNode):
             wanted |= {ODOMETRY} if not given.odometry else set()
             wanted |= {IMU} if not given.imu else set()
             wanted |= {STATIC_TF} if topic.endswith('/tf_static') else set()
-            chosen = topic in named or (wanted & {*kinds} and not is_output(self, topic))
+            chosen = topic in named or (wanted & {*kinds} and not is_ours(self, topic))
             if chosen and self._base(topic) not in bases and not topic.endswith(DEPTH):
                 bases.add(self._base(topic))
                 self._record(topic, kinds[0])
@@ -251,9 +262,13 @@ class TeachNode(LocalizationNode):
         elif not self._recorder.counts:
             said = 'waiting for images and odometry'
         else:
-            facts = self._findings.get('facts', {})
-            said = '; '.join(filter(None, [facts.get('drive', ''), self._verdict()]))
+            driven = self._findings.get('facts', {}).get('drive', '')
+            known = [driven] if any(self._findings.get('drives', [])) else []
+            said = '; '.join([*known, self._verdict()])
             said = said if self._findings else f'recording {", ".join(self._recorder.counts)}'
+        self._say_once(said)
+
+    def _say_once(self, said: str) -> None:
         if said != self._said:
             self._said = said
             self._state.publish(String(data=said))
@@ -268,9 +283,9 @@ class TeachNode(LocalizationNode):
             self._worker.stop()
         self._end_recording()
         update: list[str | Path] = ['--update', self._model] if self._model.exists() else []
-        drives = [folder] if update else self._drives()
         self._is_training = True
-        self._start_worker(*self._commands('train', *drives, '--output', self._model, *update))
+        outputs = '--output', self._model, '--json', self._judgment
+        self._start_worker(*self._commands('train', *self._pending(), *outputs, *update))
         return f'recorded {folder}; training, see teach/state'
 
     def _cancel(self, _: Any) -> str:
@@ -279,28 +294,33 @@ class TeachNode(LocalizationNode):
             self._worker = None
         self._is_training = False
         self._end_recording()
-        self._said = f'canceled; what was recorded is in {self._drives()[-1]}'
-        self._state.publish(String(data=self._said))
+        kept = []
+        for folder in self._pending():
+            kept.append(folder.with_name(folder.name.replace('_drive', '_trial')))
+            folder.rename(kept[-1])
+        self._problem = ''
+        self._say_once(f'canceled; what was recorded is in {", ".join(map(str, kept))}')
         return self._said
 
     def _extend(self, _: Any) -> str:
         if self._recorder is not None or self._worker is not None:
             raise LocalizationError('the last drive is not finished: call ~/finish or ~/cancel')
         self._findings = {}
-        folder = self._drive(len(self._drives()) + 1)
-        self._start([folder])
+        folder = self._new_drive()
+        self._start(folder)
         return f'recording into {folder}'
 
     def _trained(self, worker: Worker) -> None:
         """Say how the training ended, and let the nodes use the model."""
         self._is_training = False
-        line = worker.last_line()
         if worker.code:
-            self._problem = f'training failed: {line}; the recording is kept'
+            self._problem = f'training failed: {worker.last_line()}; the recording is kept'
+            self.get_logger().error(self._problem)
             return
         self._problem = ''
-        self._said = line
-        self._state.publish(String(data=f'{self._model} is written: {line}'))
+        judgment = json.loads(self._judgment.read_text())
+        self._say_once(f'{self._model} is written. {judgment["sentence"]}')
+        self.get_logger().info(self._said)
         reload = self.client(Trigger, 'sfa_node/reload_model')
         if self.settings(TeachNodeConfig).localize:
             for name in NODES:
