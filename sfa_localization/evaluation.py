@@ -46,7 +46,7 @@ from sfa_localization.fusion.pose_filter import PoseFilter, State, Status
 from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
-from sfa_localization.fusion.status import Level
+from sfa_localization.fusion.status import MOST_SILENCE_S, Level
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.localizer import Localizer
 from sfa_localization.motion.check import MotionCheck, check_motion
@@ -350,9 +350,31 @@ def _counts(
         'observations': usable.as_dict(),
         'fusion': dict(fused.counts),
         'states_s': dict(states_s),
+        **_longest_silence(run, observations),
         'nis': None if math.isnan(fused.nis) else fused.nis,
         **({'camera_delay_s': round(clock.delay_s, 3)} if clock.delay_ns else {}),
     }
+
+
+def _longest_silence(run: Run, observations: Sequence[Observation]) -> dict[str, Any]:
+    """`without_images`: the longest time within the odometry without a usable image, if the filter
+    would name it: `from_s` after the start of the odometry, `seconds`, and whether it lasts
+    `to_the_end` of the drive.
+    """
+    usable_ns = [image.stamp_ns for image in observations if not image.problem]
+    start_ns = run.odometry.stamps_ns[0]
+    end_ns = run.odometry.stamps_ns[-1]
+    marks_ns = np.clip([start_ns, *usable_ns, end_ns], start_ns, end_ns)
+    gaps_ns = np.diff(marks_ns)
+    longest = int(np.argmax(gaps_ns))
+    if gaps_ns[longest] <= MOST_SILENCE_S * 1e9:
+        return {}
+    silence = {
+        'from_s': float(marks_ns[longest] - start_ns) * 1e-9,
+        'seconds': float(gaps_ns[longest]) * 1e-9,
+        'to_the_end': longest == len(gaps_ns) - 1,
+    }
+    return {'without_images': silence}
 
 
 def _seconds_since_last(stamps_ns: Stamps) -> Array:
