@@ -20,7 +20,7 @@ DRIVE = FilterDrive(
 
 
 def evaluated(path, order):
-    """What is said of a drive whose images (of 5 Hz) come one by one in this order of their stamps."""
+    """What is said of a drive whose images (of 5 Hz) come in this order of stamps."""
     stamps_ns = (DRIVE.stamps_ns[DRIVE.pictures] + 7_000_000).tolist()
     with BagWriter(path) as bag:
         for i, stamp_ns in enumerate(DRIVE.stamps_ns.tolist()):
