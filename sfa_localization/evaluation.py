@@ -12,11 +12,11 @@ import logging
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import starmap
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import signal, stats
@@ -44,11 +44,11 @@ from sfa_localization.data.threads import one_core
 from sfa_localization.fusion.camera_clock import SIGNIFICANT_STDS, CameraClock, camera_clock
 from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.fusion.odometry import COAST_S
-from sfa_localization.fusion.pose_filter import PoseFilter, State
+from sfa_localization.fusion.pose_filter import PoseFilter, State, Status
 from sfa_localization.fusion.replay import FilterTrack, replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
-from sfa_localization.fusion.status import Level
+from sfa_localization.fusion.status import MOST_SILENCE_S, Level
 from sfa_localization.keyframes.closures import Closures
 from sfa_localization.localizer import Localizer
 from sfa_localization.motion.check import MotionCheck, check_motion
@@ -68,6 +68,17 @@ WRONG_M = 1.0
 """Position error from which a filter that says LOCALISED is wrong."""
 
 
+class Step(NamedTuple):
+    """What ekf_node would publish after a message: its `status`, and its `state` at the stamp of
+    the message. `image` is what sfa_node would publish of it; None after odometry.
+    """
+
+    stamp_ns: int
+    image: Observation | None
+    status: Status
+    state: State | None
+
+
 @dataclass(frozen=True, slots=True)
 class Evaluation:
     """A test drive with its errors. `estimates` are in the frame of the ground truth.
@@ -83,6 +94,9 @@ class Evaluation:
     features: Array
     aligned_on: str
     transform: RigidTransform
+    run: Run
+    steps: list[Step]
+    """What the nodes would publish on the run, in the frame of the map."""
     corrections: tuple[str, ...] = ()
     """What was corrected of the ground truth of each drive, in sentences."""
 
@@ -165,11 +179,11 @@ def _judged(
     corrections: tuple[str, ...],
 ) -> Evaluation:
     """Feed a filter with a drive, and compare the estimates with the truth."""
-    stamps_ns = drive.run.panoramas.stamps_ns
-    observations = drive.observations
     truth = drive.true
-    fed = replay(fused, drive.run.odometry, stamps_ns, observations)
-    outputs = [(at, fused.status.level, fused.at(at)) for at, image, _ in fed if image is None]
+    steps = [*_steps(drive.run, drive.observations, fused)]
+    outputs = [
+        (step.stamp_ns, step.status.level, step.state) for step in steps if step.image is None
+    ]
     states = [state for *_, state in outputs if state]
     tracks = {'sfa': drive.images, 'ekf': FilterTrack.of(states)}
     if isinstance(fused, Smoother):
@@ -182,10 +196,18 @@ def _judged(
     localised = np.array([level is Level.LOCALISED for _, level, state in outputs if state], bool)
     wrong_s = _false_localised_s(truth.poses, estimates['ekf'], localised)
     counts = {**_counts(drive, outputs, fused), 'false_localised_s': wrong_s}
-    features = np.array([image.slow_features for image in observations if not image.problem])
-    return Evaluation(
-        truth.poses, estimates, scores, counts, features, aligned_on, transform, corrections
-    )
+    usable = [image.slow_features for image in drive.observations if not image.problem]
+    features = np.array(usable)
+    judged = truth.poses, estimates, scores, counts, features
+    return Evaluation(*judged, aligned_on, transform, drive.run, steps, corrections)
+
+
+def _steps(run: Run, images: Sequence[Observation], fused: PoseFilter) -> Iterator[Step]:
+    """Feed a filter with a drive and the observations of its images."""
+    fed = replay(fused, run.odometry, run.panoramas.stamps_ns, images)
+    for stamp_ns, image, update in fed:
+        at_ns = update.stamp_ns if update else stamp_ns
+        yield Step(stamp_ns, image, fused.status, fused.at(at_ns))
 
 
 def _scores(
@@ -340,9 +362,31 @@ def _counts(
         'observations': usable.as_dict(),
         'fusion': dict(fused.counts),
         'states_s': dict(states_s),
+        **_longest_silence(run, observations),
         'nis': None if math.isnan(fused.nis) else fused.nis,
         **({'camera_delay_s': round(clock.delay_s, 3)} if clock.delay_ns else {}),
     }
+
+
+def _longest_silence(run: Run, observations: Sequence[Observation]) -> dict[str, Any]:
+    """`without_images`: the longest time within the odometry without a usable image, if the filter
+    would name it: `from_s` after the start of the odometry, `seconds`, and whether it lasts
+    `to_the_end` of the drive.
+    """
+    usable_ns = [image.stamp_ns for image in observations if not image.problem]
+    start_ns = run.odometry.stamps_ns[0]
+    end_ns = run.odometry.stamps_ns[-1]
+    marks_ns = np.clip([start_ns, *usable_ns, end_ns], start_ns, end_ns)
+    gaps_ns = np.diff(marks_ns)
+    longest = int(np.argmax(gaps_ns))
+    if gaps_ns[longest] <= MOST_SILENCE_S * 1e9:
+        return {}
+    silence = {
+        'from_s': float(marks_ns[longest] - start_ns) * 1e-9,
+        'seconds': float(gaps_ns[longest]) * 1e-9,
+        'to_the_end': longest == len(gaps_ns) - 1,
+    }
+    return {'without_images': silence}
 
 
 def _seconds_since_last(stamps_ns: Stamps) -> Array:

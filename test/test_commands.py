@@ -78,7 +78,8 @@ CASES = {
     'evaluate': """
         --align {data}/bag; --config {data}/start.yaml; --smooth; --report {out}/report
         --json {out}/figures.json; --image-topic /nothing => /nothing; --odom-topic /ground_truth
-        --imu-topic /nothing => /nothing; --ground-truth-topic /odom; --tum {out}/tum""",
+        --imu-topic /nothing => /nothing; --ground-truth-topic /odom; --tum {out}/tum
+        --bag {out}/replay""",
     'map': '--output {out}/other.yaml; --width 0.5; --cell 0.1',
     'play': '--loop; --clock; --topics /odom; --rate 500; --wait 0.01',
     'inspect': """

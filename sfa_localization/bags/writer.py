@@ -30,8 +30,9 @@ from sfa_localization.camera.encodings import encode_jpeg, encode_png
 from sfa_localization.camera.sectors import MountedCamera
 from sfa_localization.camera.settings import LensCalibration
 from sfa_localization.data.errors import BagError
-from sfa_localization.data.geometry import Array
-from sfa_localization.data.run import Image
+from sfa_localization.data.geometry import Array, Mask
+from sfa_localization.data.messages import TWIST, full_covariance
+from sfa_localization.data.run import Image, Stamps
 
 STORAGES = ('mcap', 'sqlite3')
 _NEVER = QosTime(2147483647, 4294967295)  # as ROS writes that a time is not limited
@@ -46,7 +47,13 @@ LATCHED = Qos(
     _NEVER,
     avoid_ros_namespace_conventions=False,
 )
-"""Late subscribers receive the last message, as of /tf_static."""
+"""`ros2 bag play` keeps the last message of such a topic for those who subscribe later."""
+
+
+def require_new_bag(path: Path) -> None:
+    """Raise BagError if a bag would replace something."""
+    if path.exists():
+        raise BagError(f'{path}: already exists; name another bag or remove it')
 
 
 class BagWriter:
@@ -65,8 +72,7 @@ class BagWriter:
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> BagWriter:
-        if self.path.exists():
-            raise BagError(f'{self.path}: already exists; name another bag or remove it')
+        require_new_bag(self.path)
         with self._named(), ExitStack() as stack:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             folder = TemporaryDirectory(prefix='.bag-', dir=self.path.parent)
@@ -128,6 +134,79 @@ class BagWriter:
         message.twist.covariance[[0, 35]] = twist_variance
         self.message(topic, stamp_ns, message)
 
+    def estimate(
+        self,
+        topic: str,
+        stamp_ns: int,
+        pose: Array,
+        covariance: Array,
+        twist: Array | None = None,
+        twist_covariance: Array | None = None,
+        frames: tuple[str, str] = ('map', 'base_link'),
+    ) -> None:
+        """Write a pose (3,) with covariance (3, 3) as PoseWithCovarianceStamped in frames[0], or
+        with a twist (2,) of frames[1] and its covariance (2, 2) as Odometry. A NaN yaw becomes 0.
+        """
+        if twist is None or twist_covariance is None:
+            kind = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+            message = self._stamped(kind, stamp_ns, frames[0])
+        else:
+            message = self._stamped('nav_msgs/msg/Odometry', stamp_ns, frames[0])
+            message.child_frame_id = frames[1]
+            message.twist.twist.linear.x, message.twist.twist.angular.z = map(float, twist)
+            message.twist.covariance = full_covariance(twist_covariance, TWIST)
+        _place(message.pose.pose, np.nan_to_num(pose))
+        message.pose.covariance = full_covariance(covariance)
+        self.message(topic, stamp_ns, message)
+
+    def trail(self, topic: str, stamps_ns: Stamps, poses: Array, frame_id: str) -> None:
+        """Write poses (N, 3) at stamps (N,) as one latched Path, received at the first stamp."""
+        message = self._stamped('nav_msgs/msg/Path', stamps_ns[0], frame_id)
+        for stamp_ns, pose in zip(stamps_ns.tolist(), poses, strict=True):
+            one = self._stamped('geometry_msgs/msg/PoseStamped', stamp_ns, frame_id)
+            _place(one.pose, pose)
+            message.poses.append(one)
+        self.message(topic, int(stamps_ns[0]), message, latched=True)
+
+    def grid(
+        self, topic: str, stamp_ns: int, free: Mask, corner: Array, cell_m: float, frame_id: str
+    ) -> None:
+        """Write cells (H, W), row 0 at the lowest y, as a latched OccupancyGrid: free or unknown;
+        `corner` (2,) m is the lower left corner of the first cell.
+        """
+        message = self._stamped('nav_msgs/msg/OccupancyGrid', stamp_ns, frame_id)
+        message.info.map_load_time = message.header.stamp
+        message.info.resolution = cell_m
+        message.info.height, message.info.width = free.shape
+        _place(message.info.origin, np.append(corner, 0.0))
+        message.data = np.where(free, 0, -1).astype(np.int8).ravel()
+        self.message(topic, stamp_ns, message, latched=True)
+
+    def text(self, topic: str, stamp_ns: int, text: str) -> None:
+        """Write a latched String."""
+        message = blank(self._types, 'std_msgs/msg/String')
+        message.data = text
+        self.message(topic, stamp_ns, message, latched=True)
+
+    def array(self, topic: str, stamp_ns: int, values: Array) -> None:
+        """Write a vector as Float64MultiArray."""
+        message = blank(self._types, 'std_msgs/msg/Float64MultiArray')
+        message.data = np.asarray(values, float)
+        self.message(topic, stamp_ns, message)
+
+    def static_transform(self, stamp_ns: int, pose: Array, frames: tuple[str, str]) -> None:
+        """Write the pose (3,) of frames[1] in frames[0] on /tf_static."""
+        transform = self._stamped('geometry_msgs/msg/TransformStamped', stamp_ns, frames[0])
+        transform.child_frame_id = frames[1]
+        x, y, yaw_rad = map(float, pose)
+        transform.transform.translation.x = x
+        transform.transform.translation.y = y
+        transform.transform.rotation.z = float(np.sin(yaw_rad / 2))
+        transform.transform.rotation.w = float(np.cos(yaw_rad / 2))
+        message = blank(self._types, 'tf2_msgs/msg/TFMessage')
+        message.transforms = [transform]
+        self.message('/tf_static', stamp_ns, message, latched=True)
+
     def imu(self, topic: str, stamp_ns: int, omega: float, variance: float) -> None:
         """Write a gyroscope's yaw rate (rad/s); orientation and acceleration are marked unknown."""
         message = self._stamped('sensor_msgs/msg/Imu', stamp_ns, 'base_link')
@@ -171,15 +250,16 @@ class BagWriter:
             moved.x, moved.y, moved.z = camera.place
             turned.x, turned.y, turned.z, turned.w = _quaternion(np.array(camera.rotation))
             message.transforms.append(part)
-        self.message('/tf_static', stamp_ns, message, LATCHED)
+        self.message('/tf_static', stamp_ns, message, latched=True)
 
-    def message(self, topic: str, stamp_ns: int, message: Any, *qos: Qos) -> None:
-        """Write any message of the rosbags type store, received at `stamp_ns`; `qos` is what its
-        publisher offered.
+    def message(self, topic: str, stamp_ns: int, message: Any, latched: bool = False) -> None:
+        """Write any message of the rosbags type store, received at `stamp_ns`; a `latched` topic
+        keeps its last one for those who subscribe later.
         """
         kind = message.__msgtype__
         connection = self._connections.get(topic)
         if connection is None:
+            qos = [LATCHED] if latched else []
             connection = self._writer.add_connection(
                 topic, kind, typestore=self._types, offered_qos_profiles=qos
             )

@@ -27,11 +27,13 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 WRITES = """\
 tables on standard output; with --report index.html (one page for a browser) and its figures;
-  with --json the grade (good, weak or bad), a sentence, and the errors; with --tum paths for evo"""
+  with --json the grade (good, weak or bad), a sentence, and the errors; with --tum paths for evo;
+  with --bag what the nodes would publish, as a bag for RViz and Foxglove"""
 EXAMPLES = """\
   evaluate garden.npz bags/test --align bags/coverage
   evaluate garden.npz bags/test --align none
   evaluate garden.npz bags/test --align bags/coverage --report report --json results.json
+  evaluate garden.npz bags/test --align bags/coverage --bag replay
   evaluate before.json after.json --report report"""
 
 
@@ -61,12 +63,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--tum', type=Path, metavar='DIR', help='write truth and estimates in the format of TUM'
     )
+    parser.add_argument(
+        '--bag',
+        dest='replay',
+        type=Path,
+        metavar='NEW_BAG',
+        help='write what the nodes would publish on the drive, and the truth, as a bag',
+    )
     options.add_topics(parser, 'image', 'odometry', 'imu', 'ground_truth')
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate; print the errors, and counts of used and rejected inputs."""
     from sfa_localization import evaluation
+    from sfa_localization.bags.writer import require_new_bag
+    from sfa_localization.commands.replay_bag import write_replay
     from sfa_localization.place_model import PlaceModel
     from sfa_localization.reports.evaluation import count_lines, tables, trust_lines
 
@@ -81,6 +92,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         options.require_output(arguments.json, read, '.json')
     options.require_report(arguments.report, arguments.json)
+    if arguments.replay:
+        require_new_bag(arguments.replay)
     model = PlaceModel.load(arguments.model)
     options.require_same_panorama(arguments.config, model.panorama)
     with options.noticed() as warnings:
@@ -105,6 +118,9 @@ def run(arguments: argparse.Namespace) -> int:
     print(*count_lines(result.counts), sep='\n')
     print(f'aligned on {result.aligned_on}', *result.corrections, sep='\n')
     _write_files(arguments, model, result, warnings)
+    if arguments.replay:
+        write_replay(arguments.replay, result, model.ground)
+        print(f'{arguments.replay}: written')
     return 0
 
 

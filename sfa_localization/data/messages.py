@@ -12,7 +12,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from sfa_localization.data.errors import MessageError
+from sfa_localization.data.geometry import Array
 
 NANOSECONDS = 1_000_000_000
 NO_STAMP = 'zero or negative stamp'
@@ -27,6 +30,11 @@ LARGEST_SCALE = 1.5
 """A larger scale of odometry is no error of wheels, but another unit."""
 _SHORTEST_QUATERNION = 1e-3
 """A shorter quaternion has no direction; normalized ones have length 1."""
+PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+TWIST = np.ix_([0, 5], [0, 5])
+"""Rows and columns of x, y and yaw, and of v and omega, in the covariances of messages."""
+_FIXED = np.diag([1e-6] * 6)
+"""Covariance of z, roll and pitch, which a planar estimate fixes."""
 _STEEPEST = math.radians(45.0)
 """No robot on wheels rolls or pitches this much: the axes of the IMU are others, as z down."""
 
@@ -102,6 +110,13 @@ def read_tilt(message: Any) -> tuple[float, float]:
     if max(abs(roll), abs(pitch)) > _STEEPEST:
         raise MessageError('on its side: are the axes of the IMU those of the robot?')
     return roll, pitch
+
+
+def full_covariance(covariance: Array, places: Any = PLANAR) -> Array:
+    """The covariance (36,) of a message from its rows and columns at `places`."""
+    full = _FIXED.copy()
+    full[places] = covariance
+    return full.ravel()
 
 
 def _length(q: Any) -> float:

@@ -44,6 +44,11 @@ class Status:
     level: Level
     reasons: tuple[str, ...] = ()
 
+    def __str__(self) -> str:
+        """As on ekf/state."""
+        reasons = '; '.join(self.reasons)
+        return f'{self.level.name}: {reasons}' if reasons else self.level.name
+
     def with_reasons(self, lost: Sequence[str], degraded: Sequence[str]) -> Status:
         """Add reasons and lower the level; UNINITIALISED stays."""
         level = Level.LOST if lost else Level.DEGRADED if degraded else Level.LOCALISED

@@ -36,10 +36,6 @@ from sfa_localization.data.rig import Rig
 from sfa_localization.data.run import Image
 from sfa_localization.mapping.driven_ground import Cells, DrivenGround
 
-_FIXED = np.diag([1e-6] * 6)
-"""Covariance of z, roll and pitch, which a planar estimate fixes."""
-_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
-_TWIST = np.ix_([0, 5], [0, 5])
 _CORRELATION = 'error_correlation'
 _OCCUPIED = 100
 _TEXT_M = 0.4
@@ -105,7 +101,7 @@ def read_odometry(
 def read_pose(message: geometry.PoseWithCovarianceStamped) -> tuple[int, Array, Array]:
     """Stamp, pose (3,) and its covariance (3, 3), all zeros if unknown."""
     pose = np.array(messages.read_planar(message.pose.pose.position, message.pose.pose.orientation))
-    covariance = np.asarray(message.pose.covariance, float).reshape(6, 6)[_PLANAR]
+    covariance = np.asarray(message.pose.covariance, float).reshape(6, 6)[messages.PLANAR]
     require_sane('covariance', *covariance.ravel().tolist())
     if covariance.diagonal().min() < 0:
         raise MessageError('negative variance')
@@ -127,7 +123,7 @@ def to_pose_with_covariance(
     """A pose (3,) and its covariance (3, 3) as a message."""
     message = geometry.PoseWithCovarianceStamped(header=_header(stamp_ns, frame))
     _fill(message.pose.pose, pose)
-    message.pose.covariance = _full(covariance, _PLANAR)
+    message.pose.covariance = messages.full_covariance(covariance)
     return message
 
 
@@ -142,9 +138,9 @@ def to_odometry(
     """Pose in frames[0] and twist (v, omega) in frames[1], with (3, 3) and (2, 2) covariances."""
     message = Odometry(header=_header(stamp_ns, frames[0]), child_frame_id=frames[1])
     _fill(message.pose.pose, pose)
-    message.pose.covariance = _full(covariance, _PLANAR)
+    message.pose.covariance = messages.full_covariance(covariance)
     message.twist.twist.linear.x, message.twist.twist.angular.z = np.asarray(twist, float).tolist()
-    message.twist.covariance = _full(twist_covariance, _TWIST)
+    message.twist.covariance = messages.full_covariance(twist_covariance, messages.TWIST)
     return message
 
 
@@ -255,13 +251,6 @@ def _read_json(message: String) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise MessageError('is no JSON object')
     return values
-
-
-def _full(covariance: Array, places: Any) -> Array:
-    """The covariance (36,) of a message from its rows and columns at `places`."""
-    full = _FIXED.copy()
-    full[places] = covariance
-    return full.ravel()
 
 
 def _header(stamp_ns: int, frame: str) -> Header:

@@ -399,8 +399,7 @@ class EkfNode(LocalizationNode):
         status = self.status()
         if status.level is Level.LOCALISED:
             self._reliable = self.filter.state
-        reasons = '; '.join(status.reasons)
-        text = f'{status.level.name}: {reasons}' if reasons else status.level.name
+        text = str(status)
         level, before, published_s = self._published_state
         changed = status.level is not level
         now_s = steady_s()

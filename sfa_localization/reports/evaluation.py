@@ -58,6 +58,7 @@ MARGIN_M = 0.5
 TRUSTED_SHARE = 0.8
 """Share of true positions in the filter's 95 % regions below which its covariances are too small;
 errors of neighboring images are correlated, so the share varies."""
+_UNORDERED = 'stamp jumps', 'stamp out of order'
 _WEAK = 2.0  # times the mean error, from which a place counts as weak
 
 
@@ -380,6 +381,7 @@ def count_lines(counts: Mapping[str, Any]) -> list[str]:
         reasons = ''.join(f'; {n} skipped: {reason}' for reason, n in skipped)
         lines.append(f'{stream}: {counts[stream]["used"]} used{reasons}')
     usual = 'odometry: used', 'measurement: accepted', 'measurement: started'
+    lines += _image_lines(counts)
     rejected = sorted((why, n) for why, n in counts['fusion'].items() if why not in usual)
     lines += [f'filter: {n} times {reason}' for reason, n in rejected]
     states = ', '.join(f'{name} {seconds:.1f} s' for name, seconds in counts['states_s'].items())
@@ -390,3 +392,21 @@ def count_lines(counts: Mapping[str, Any]) -> list[str]:
         late = 'late' if delay > 0 else 'early'
         lines.append(f'camera: images are stamped {abs(delay):.2f} s {late}')
     return lines
+
+
+def _image_lines(counts: Mapping[str, Any]) -> Iterator[str]:
+    """What is wrong with the images of the drive, and the remedy."""
+    skipped = counts['images']['skipped']
+    if unordered := sum(skipped.get(reason, 0) for reason in _UNORDERED):
+        total = counts['images']['used'] + sum(skipped.values())
+        yield (
+            f'images: {unordered} of {total} are left out because their stamps jump or are out of '
+            'order: the driver must stamp images when they are taken, and send them in that order'
+        )
+    if silence := counts.get('without_images'):
+        start_s = silence['from_s']
+        end = 'the end' if silence['to_the_end'] else f'{start_s + silence["seconds"]:.0f} s'
+        yield (
+            f'images: none could be used from {start_s:.0f} s of the drive to {end}: '
+            'does the camera stop, or is its view dark or covered there?'
+        )
