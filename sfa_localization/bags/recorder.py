@@ -19,11 +19,17 @@ from sfa_localization.data.errors import BagError
 from sfa_localization.data.files import write_bytes
 
 
+def recorded_files(folder: Path) -> list[Path]:
+    """The files of a recorded drive that hold something."""
+    return sorted(path for path in folder.glob('*.mcap') if path.stat().st_size)
+
+
 class BagRecorder:
     """Writes serialized messages into a new mcap file in a folder, which becomes a bag of rosbag2.
 
-    What a folder holds already stays: the bag goes on in its next file, and has no metadata.yaml
-    then, which `ros2 bag reindex` writes. Raises BagError where it cannot be written.
+    The messages that a folder holds already stay: the bag goes on in its next file, and has no
+    metadata.yaml then, which `ros2 bag reindex` writes. Files are empty until their first message,
+    and empty ones are removed. Raises BagError where it cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -34,18 +40,21 @@ class BagRecorder:
         self._stamps_ns: list[int] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._earlier = sorted(folder.glob('*.mcap'))
-            (folder / METADATA).unlink(missing_ok=True)
+            self._earlier = recorded_files(folder)
+            for path in {*folder.glob('*.mcap')} - {*self._earlier}:
+                path.unlink()
             self._path = folder / f'{folder.name}_{len(self._earlier)}.mcap'
             self._file: IO[bytes] = self._path.open('xb')
             self._writer = Writer(self._file)
-            self._writer.start('ros2', library='sfa_localization')
         except OSError as error:
             raise self._failed(error) from None
 
     def write(self, topic: str, kind: str, data: bytes, received_ns: int) -> None:
         """Write a message of a type, `data`, as it was serialized."""
         try:
+            if not self._channels:
+                self._writer.start('ros2', library='sfa_localization')
+                (self.folder / METADATA).unlink(missing_ok=True)
             if topic not in self._channels:
                 self._channels[topic] = self._channel(topic, kind)
                 self._kinds[topic] = kind
@@ -57,6 +66,8 @@ class BagRecorder:
 
     def flush(self) -> None:
         """Hand to the system what was written so far."""
+        if not self.counts:
+            return
         try:
             self._writer.flush()  # type: ignore[no-untyped-call]
         except OSError as error:
@@ -66,8 +77,11 @@ class BagRecorder:
         """Complete the file, and write the metadata if it is the only one."""
         try:
             with self._file:
-                self._writer.finish()  # type: ignore[no-untyped-call]
-            if not self._earlier:
+                if self.counts:
+                    self._writer.finish()  # type: ignore[no-untyped-call]
+            if not self.counts:
+                self._path.unlink()
+            elif not self._earlier:
                 text = yaml.safe_dump(self._metadata(), sort_keys=False)
                 write_bytes(self.folder / METADATA, text.encode(), BagError)
         except OSError as error:
