@@ -4,6 +4,7 @@
 
 import errno
 import os
+import signal
 import subprocess
 from pathlib import Path
 from unittest import mock
@@ -33,6 +34,7 @@ from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.nodes.omnicam_node import OmnicamNode
 from sfa_localization.nodes.sfa_node import SfaNode
 from sfa_localization.nodes.teach_node import TeachNode
+from sfa_localization.nodes.worker import Worker
 
 pytestmark = pytest.mark.ros
 KINDS = {'/odom': Odometry, '/imu': Imu, '/panorama_raw/compressed': CompressedImage}
@@ -121,6 +123,27 @@ def test_a_command_ends_with_a_node_that_is_killed(tmp_path):
     node.kill()
     node.communicate()
     assert until(lambda: not is_running(pid))
+
+
+def test_a_signal_is_named_in_place_of_the_progress(tmp_path):
+    worker = Worker(['play', SAMPLE, '--wait', '1000'], tmp_path / 'log')
+    os.kill(worker._process.pid, signal.SIGKILL)
+    assert until(lambda: worker.code is not None)
+    assert worker.failure() == 'SIGKILL ended it, as by a system without memory'
+    worker = Worker(['play', tmp_path / 'none'], tmp_path / 'log')
+    assert until(lambda: worker.code is not None)
+    assert worker.failure() == worker.last_line() and 'no such bag' in worker.failure()
+
+
+def test_a_disk_that_cannot_keep_the_bag_is_named(tmp_path):
+    recorder = BagRecorder(tmp_path / 'drive')
+    recorder.write(*records(SAMPLE)[0])
+    with mock.patch('os.fsync', side_effect=OSError(errno.EIO, os.strerror(errno.EIO))):
+        recorder.flush()
+        assert until(recorder._synced.done)
+    with pytest.raises(BagError, match='drive: cannot be written: Input/output error'):
+        recorder.flush()
+    recorder.close()
 
 
 @pytest.fixture

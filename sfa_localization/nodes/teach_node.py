@@ -259,7 +259,7 @@ class TeachNode(LocalizationNode):
         if self._recorder is None:
             return
         if not report.exists():
-            self._problem = self._words(worker.last_line())
+            self._problem = self._words(worker.failure())
             return
         self._problem = ''
         (self._findings,) = json.loads(report.read_text())['bags']
@@ -370,8 +370,8 @@ class TeachNode(LocalizationNode):
         """Say how the training ended; the nodes get the model as soon as they are there."""
         self._is_training = False
         if worker.code:
-            line = self._words(worker.last_line())
-            self._problem = f'training failed: {line}; the recording is kept for ~/finish'
+            why = self._words(worker.failure())
+            self._problem = f'training failed: {why}; the recording is kept for ~/finish'
             return
         self._publish(f'{self._model} is written')
         self._waiting = list(self._chain)

@@ -60,6 +60,14 @@ class Worker:
         lines = [line.strip() for line in text.replace('\r', '\n').split('\n')]
         return next(filter(None, reversed(lines)), '')
 
+    def failure(self) -> str:
+        """Why it failed: the signal that ended it, or what it printed last."""
+        if self.code is None or self.code >= 0:
+            return self.last_line()
+        name = signal.Signals(-self.code).name
+        memory = ', as by a system without memory' if name == 'SIGKILL' else ''
+        return f'{name} ended it{memory}'
+
     def stop(self) -> None:
         """End it, as a terminal does; what it wrote stays whole."""
         if self.code is not None:
