@@ -31,8 +31,10 @@ TWINS = {
     'writing a file, whole or not at all': (
         r"\.write_(text|bytes)\(|imwrite\(|savetxt\(|mk[ds]temp\(|\.rename\(|NamedTemporaryFile\(|"
         r"fdopen\(|open\([^)]*'[wxa]b?'",
-        # A folder that is renamed when whole; temporary folders; standard output.
-        {'data/files.py', 'bags/writer.py', 'bags/files.py', 'commands/live_nodes.py', 'cli.py'},
+        # A folder that is renamed when whole; temporary folders; standard output; a bag and a log
+        # that grow.
+        {'data/files.py', 'bags/writer.py', 'bags/files.py', 'commands/live_nodes.py', 'cli.py',
+         'bags/recorder.py', 'nodes/worker.py'},
     ),
     'a filter for a model': (
         r'(fused|filter)\.expect\(', {'localizer.py', 'nodes/ekf_node.py'},

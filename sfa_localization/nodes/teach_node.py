@@ -33,6 +33,7 @@ from sfa_localization.bags.reader import KINDS, Bag
 from sfa_localization.bags.recorder import BagRecorder, recorded_files
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.data.errors import BagError, ConfigError, LocalizationError
+from sfa_localization.data.geometry import Array
 from sfa_localization.mapping.driven_ground import DrivenGround
 from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.nodes import conversions as convert
@@ -86,6 +87,11 @@ class TeachNode(LocalizationNode):
         self._state = self.publisher(String, 'teach/state', latched)
         self._map = self.publisher(OccupancyGrid, 'teach/map', latched)
         self._hints = self.publisher(MarkerArray, 'teach/hints', latched)
+        self._offer_services()
+        self.every(1.0, self._step)
+
+    def _offer_services(self) -> None:
+        """Make services, and clients of the nodes early: to be found takes them a moment."""
         self.service(Trigger, '~/finish', self._finish)
         self.service(Trigger, '~/cancel', self._cancel)
         self.service(Trigger, '~/extend', self._extend)
@@ -94,7 +100,6 @@ class TeachNode(LocalizationNode):
         self._chain = [self.client(ChangeState, f'{name}/change_state') for name in names]
         self._waiting = list(self._chain) if self._model.exists() else []
         self._is_new = bool(self._waiting)
-        self.every(1.0, self._step)
 
     def teardown(self) -> None:
         if self._worker is not None:
@@ -149,22 +154,26 @@ class TeachNode(LocalizationNode):
 
     def _listen(self) -> None:
         """Subscribe to new inputs: images, each in one transport, odometry, IMUs, /tf_static."""
-        given = self.settings(TopicNames)
-        names = given.image, given.odometry, given.imu, given.points_topic
-        named = {*map(self._full, names)}
+        named, types = self._wanted()
         bases = {self._base(topic) for topic in self._recorded}
         topics = sorted(self.get_topic_names_and_types(), reverse=True)
         # A drive goes on in the transport of its beginning.
         for topic, kinds in sorted(topics, key=lambda each: each[0] not in self._topics.values()):
-            wanted = {*TRANSPORTS.values()} if not given.image else set()
-            wanted |= {ODOMETRY} if not given.odometry else set()
-            wanted |= {IMU} if not given.imu else set()
-            wanted |= {STATIC_TF} if topic.endswith('/tf_static') else set()
+            wanted = types | ({STATIC_TF} if topic.endswith('/tf_static') else set())
             base = self._base(topic)
             chosen = base in named or (wanted & {*kinds} and not is_output(self, topic))
             if chosen and base not in bases and not topic.endswith(DEPTH):
                 bases.add(base)
                 self._record(topic, kinds[0])
+
+    def _wanted(self) -> tuple[set[str], set[str]]:
+        """The topics that parameters name, and the types of the inputs that they do not name."""
+        given = self.settings(TopicNames)
+        names = given.image, given.odometry, given.imu, given.points_topic
+        types = {*TRANSPORTS.values()} if not given.image else set()
+        types |= {ODOMETRY} if not given.odometry else set()
+        types |= {IMU} if not given.imu else set()
+        return {*map(self._full, names)}, types
 
     @staticmethod
     def _base(topic: str) -> str:
@@ -264,8 +273,11 @@ class TeachNode(LocalizationNode):
         self._problem = ''
         (self._findings,) = json.loads(report.read_text())['bags']
         places = [np.array(drive) for drive in self._findings['drives'] if drive]
-        if not places:
-            return
+        if places:
+            self._show(places)
+
+    def _show(self, places: list[Array]) -> None:
+        """Publish the places (M, 3) of images of each part of the drive, and the ground covered."""
         frame = self.settings(TeachNodeConfig).odom_frame
         now_ns = self.get_clock().now().nanoseconds
         driven = np.concatenate(places)[:, :2]
