@@ -4,6 +4,9 @@
 
 import errno
 import os
+import signal
+import subprocess
+from pathlib import Path
 from unittest import mock
 
 import pytest
@@ -17,10 +20,11 @@ from sfa_localization.place_model import PlaceModel
 
 pytest.importorskip('rclpy')
 
+import rclpy
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.serialization import deserialize_message
-from ros_bench import until
-from sensor_msgs.msg import CompressedImage, Imu
+from ros_bench import start_process, until
+from sensor_msgs.msg import CompressedImage, Image, Imu
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -30,6 +34,7 @@ from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.nodes.omnicam_node import OmnicamNode
 from sfa_localization.nodes.sfa_node import SfaNode
 from sfa_localization.nodes.teach_node import TeachNode
+from sfa_localization.nodes.worker import Worker
 
 pytestmark = pytest.mark.ros
 KINDS = {'/odom': Odometry, '/imu': Imu, '/panorama_raw/compressed': CompressedImage}
@@ -83,6 +88,62 @@ def test_a_full_disk_names_the_bag_and_the_reason(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder._writer, 'flush', mock.Mock(side_effect=full))
     with pytest.raises(BagError, match='drive: cannot be written: No space left on device'):
         recorder.flush()
+
+
+def test_a_recorder_without_messages_leaves_the_bag_as_it_was(tmp_path):
+    BagRecorder(tmp_path / 'new').close()
+    assert [*(tmp_path / 'new').iterdir()] == []
+    recorder = BagRecorder(tmp_path / 'drive')
+    recorder.write(*records(SAMPLE)[0])
+    recorder.close()
+    before = sorted(path.name for path in (tmp_path / 'drive').iterdir())
+    BagRecorder(tmp_path / 'drive')  # and the power fails
+    (tmp_path / 'drive/drive_7.mcap').touch()
+    BagRecorder(tmp_path / 'drive').close()
+    assert sorted(path.name for path in (tmp_path / 'drive').iterdir()) == before
+    assert before == ['drive_0.mcap', 'metadata.yaml']
+
+
+def is_running(pid):
+    """Whether a process has not ended, also where nobody waits for it."""
+    stat = Path(f'/proc/{pid}/stat')
+    return stat.exists() and stat.read_text().rpartition(') ')[2][0] != 'Z'
+
+
+def test_a_command_ends_with_a_node_that_is_killed(tmp_path):
+    code = (
+        'import sys, time; from pathlib import Path; from sfa_localization.nodes.worker import '
+        "Worker; worker = Worker(['play', sys.argv[1], '--wait', '1000'], Path(sys.argv[2])); "
+        'print(worker._process.pid, flush=True); time.sleep(1000)'
+    )
+    node = start_process('-c', code, SAMPLE, tmp_path / 'log', stdout=subprocess.PIPE)
+    pid = int(node.stdout.readline())
+    assert until(lambda: b'sfa_localization' in Path(f'/proc/{pid}/cmdline').read_bytes())
+    assert is_running(pid)
+    node.kill()
+    node.communicate()
+    assert until(lambda: not is_running(pid))
+
+
+def test_a_signal_is_named_in_place_of_the_progress(tmp_path):
+    worker = Worker(['play', SAMPLE, '--wait', '1000'], tmp_path / 'log')
+    os.kill(worker._process.pid, signal.SIGKILL)
+    assert until(lambda: worker.code is not None)
+    assert worker.failure() == 'SIGKILL ended it, as by a system without memory'
+    worker = Worker(['play', tmp_path / 'none'], tmp_path / 'log')
+    assert until(lambda: worker.code is not None)
+    assert worker.failure() == worker.last_line() and 'no such bag' in worker.failure()
+
+
+def test_a_disk_that_cannot_keep_the_bag_is_named(tmp_path):
+    recorder = BagRecorder(tmp_path / 'drive')
+    recorder.write(*records(SAMPLE)[0])
+    with mock.patch('os.fsync', side_effect=OSError(errno.EIO, os.strerror(errno.EIO))):
+        recorder.flush()
+        assert until(recorder._synced.done)
+    with pytest.raises(BagError, match='drive: cannot be written: Input/output error'):
+        recorder.flush()
+    recorder.close()
 
 
 @pytest.fixture
@@ -157,8 +218,6 @@ def test_a_drive_is_taught_and_learned(bench, chain, taught, tmp_path):
     localize(bench, inputs, located)
     assert call(bench, 'extend').success and taught._recorder.folder.name == 'garden_drive2'
     assert call(bench, 'cancel').success
-    assert [*tmp_path.glob('garden_trial2')] and not [*tmp_path.glob('garden_drive2')]
-    assert call(bench, 'extend').success and taught._recorder.folder.name == 'garden_drive3'
 
 
 def localize(bench, inputs, located):
@@ -176,9 +235,78 @@ def localize(bench, inputs, located):
     assert until(lambda: located[-1].data == 'LOCALISED', 5.0), located[-1].data
 
 
-def test_panoramas_are_recorded_unless_this_package_makes_them(bench, taught):
-    bench.publish('/panorama/compressed', CompressedImage())
-    assert until(lambda: '/panorama/compressed' in taught._recorder.counts)
+def record(folder, *topics):
+    """A drive with the first messages of the sample, under other names of topics."""
+    recorder = BagRecorder(folder)
+    for topic, kind, data, at_ns in records(SAMPLE)[:300]:
+        recorder.write(dict(topics).get(topic, topic), kind, data, at_ns)
+    recorder.close()
+
+
+def test_only_what_was_not_taught_goes_on(bench, tmp_path):
+    output = tmp_path / 'garden.npz'
+    record(tmp_path / 'garden_drive1')
+    output.touch()
+    node = bench.run(TeachNode, output=str(output))
+    said = bench.listen(String, 'teach/state', latched_qos())
+    assert until(
+        lambda: said and said[-1].data == f'{output} is there: call ~/extend to drive more'
+    )
+    assert not call(bench, 'finish').success and not call(bench, 'cancel').success
+    assert call(bench, 'extend').message.endswith('garden_drive2')
+    assert call(bench, 'cancel').success and not any((tmp_path / 'garden_drive2').iterdir())
+    bench.end(node)
+    os.utime(output, (1.0, 1.0))
+    node = bench.run(TeachNode, output=str(output))
+    goes_on = f'waiting for images and odometry to go on with {tmp_path}/garden_drive1'
+    assert until(lambda: said[-1].data == goes_on), said[-1].data
+    answer = call(bench, 'finish')
+    assert answer.success and answer.message.startswith(f'training on {tmp_path}/garden_drive1;')
+    assert not call(bench, 'finish').success and not call(bench, 'extend').success
+    assert until(lambda: said[-1].data.startswith('training failed: ')), said[-1].data
+    assert '--' not in said[-1].data and 'kept for ~/finish' in said[-1].data
+    answer = call(bench, 'finish')
+    assert answer.success and call(bench, 'cancel').success
+    assert said[-1].data == f'canceled; {tmp_path}/garden_drive1: kept for ~/finish'
+
+
+def test_a_drive_that_ended_with_the_disk_is_finished(bench, taught):
+    bench.publish('/odom', Odometry())
+    assert until(lambda: taught._recorder.counts.total() and taught._recorder._file.tell())
+    full = BagError('drive: cannot be written: No space left on device')
+    with mock.patch.object(taught._recorder, 'flush', side_effect=full):
+        assert until(lambda: 'make room, then call ~/finish' in taught._said), taught._said
+    assert call(bench, 'finish').success and call(bench, 'cancel').success
+
+
+def test_inputs_that_stop_or_have_two_publishers_are_named(bench, taught):
+    said = bench.listen(String, 'teach/state', latched_qos())
+    bench.publish_until('/odom', Odometry(), lambda: said and 'recording /odom' in said[-1].data)
+    bench.node.create_publisher(Imu, '/imu', 10)
+    second = rclpy.create_node('second', context=bench.context)
+    second.create_publisher(Odometry, '/odom', 10)
+    twice = 'bench and second publish on /odom: end all but one'
+    assert bench.publish_until('/odom', Odometry(), lambda: twice in said[-1].data)
+    second.destroy_node()
+    assert until(lambda: twice not in said[-1].data)
+    assert until(lambda: 'nothing comes from /odom' in said[-1].data), said[-1].data
+    assert '/imu' not in said[-1].data  # it never sent anything
+
+
+def test_topics_are_named_without_transport_and_a_drive_keeps_its_transport(bench, tmp_path):
+    names = {'image': '/image_raw', 'odometry': 'wheels'}
+    raw = '/panorama/compressed', '/image_raw'
+    record(tmp_path / 'new_drive1', raw, ('/odom', '/wheels'))
+    for topic, kind in (('/image_raw', Image), ('/image_raw/compressed', CompressedImage)):
+        bench.node.create_publisher(kind, topic, 10)
+    bench.node.create_publisher(Odometry, '/wheels', 10)
+    for model, image in (('old', '/image_raw/compressed'), ('new', '/image_raw')):
+        node = bench.run(TeachNode, output=str(tmp_path / f'{model}.npz'), **names)
+        assert until(lambda: len(node._recorded) == 2)  # noqa: B023
+        assert {*node._recorded} == {image, '/wheels'}
+        words = ['--image-topic', image, '--odom-topic', '/wheels']
+        assert node._commands('inspect') == ['inspect', *words]
+        bench.end(node)
 
 
 def test_a_name_is_needed_and_nothing_is_finished_before_it_began(bench, taught):
@@ -186,3 +314,8 @@ def test_a_name_is_needed_and_nothing_is_finished_before_it_began(bench, taught)
     assert not answer.success and 'nothing was recorded yet' in answer.message
     node = bench.run(TeachNode, start=False, options={'namespace': 'other'})
     assert not node.start() and "parameter 'output' is empty" in node.failure
+
+
+def test_panoramas_are_recorded_unless_this_package_makes_them(bench, taught):
+    bench.publish('/panorama/compressed', CompressedImage())
+    assert until(lambda: '/panorama/compressed' in taught._recorder.counts)

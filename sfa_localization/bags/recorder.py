@@ -5,12 +5,14 @@
 from __future__ import annotations
 
 import copy
+import os
 from collections import Counter
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import IO, Any
 
 import yaml
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores
 
 from sfa_localization.bags.decoding import typestore
@@ -19,11 +21,18 @@ from sfa_localization.data.errors import BagError
 from sfa_localization.data.files import write_bytes
 
 
+def recorded_files(folder: Path) -> list[Path]:
+    """The files of a recorded drive that hold something."""
+    return sorted(path for path in folder.glob('*.mcap') if path.stat().st_size)
+
+
 class BagRecorder:
     """Writes serialized messages into a new mcap file in a folder, which becomes a bag of rosbag2.
 
-    What a folder holds already stays: the bag goes on in its next file, and has no metadata.yaml
-    then, which `ros2 bag reindex` writes. Raises BagError where it cannot be written.
+    The messages that a folder holds already stay: the bag goes on in its next file, and has no
+    metadata.yaml then, which `ros2 bag reindex` writes. Files are empty until their first message,
+    and empty ones are removed. Nothing is compressed: on a core, zstd costs 0.19 of it for 10 raw
+    images of 1280 x 960 a second, and 0.02 without. Raises BagError where it cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -34,18 +43,23 @@ class BagRecorder:
         self._stamps_ns: list[int] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._earlier = sorted(folder.glob('*.mcap'))
-            (folder / METADATA).unlink(missing_ok=True)
+            self._earlier = recorded_files(folder)
+            for path in {*folder.glob('*.mcap')} - {*self._earlier}:
+                path.unlink()
             self._path = folder / f'{folder.name}_{len(self._earlier)}.mcap'
             self._file: IO[bytes] = self._path.open('xb')
-            self._writer = Writer(self._file)
-            self._writer.start('ros2', library='sfa_localization')
+            self._writer = Writer(self._file, compression=CompressionType.NONE)
+            self._disk = ThreadPoolExecutor(1)
+            self._synced: Future[None] | None = None
         except OSError as error:
             raise self._failed(error) from None
 
     def write(self, topic: str, kind: str, data: bytes, received_ns: int) -> None:
         """Write a message of a type, `data`, as it was serialized."""
         try:
+            if not self._channels:
+                self._writer.start('ros2', library='sfa_localization')
+                (self.folder / METADATA).unlink(missing_ok=True)
             if topic not in self._channels:
                 self._channels[topic] = self._channel(topic, kind)
                 self._kinds[topic] = kind
@@ -56,18 +70,29 @@ class BagRecorder:
         self._stamps_ns = [*self._stamps_ns[:1], received_ns]
 
     def flush(self) -> None:
-        """Hand to the system what was written so far."""
+        """Hand to the system what was written so far, and let the disk keep it, which takes its
+        time: an error is raised by the next call.
+        """
+        if not self.counts:
+            return
         try:
             self._writer.flush()  # type: ignore[no-untyped-call]
+            if self._synced is None or self._synced.done():
+                if self._synced is not None:
+                    self._synced.result()
+                self._synced = self._disk.submit(os.fsync, self._file.fileno())
         except OSError as error:
             raise self._failed(error) from None
 
     def close(self) -> None:
         """Complete the file, and write the metadata if it is the only one."""
         try:
-            with self._file:
-                self._writer.finish()  # type: ignore[no-untyped-call]
-            if not self._earlier:
+            with self._file, self._disk:
+                if self.counts:
+                    self._writer.finish()  # type: ignore[no-untyped-call]
+            if not self.counts:
+                self._path.unlink()
+            elif not self._earlier:
                 text = yaml.safe_dump(self._metadata(), sort_keys=False)
                 write_bytes(self.folder / METADATA, text.encode(), BagError)
         except OSError as error:

@@ -52,6 +52,10 @@ class TeachNodeConfig(Settings):
         0.2, 'share of a core for looking at the drive while it is driven', low=0.01, high=1.0,
         live=True,
     )  # fmt: skip
+    silence_timeout: float = setting(
+        2.0, 'time without messages of an input that is named', unit='s', low=0.1, high=3600.0,
+        live=True,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,11 @@ process of their own, so that what is said here is what they say of the bag.
 from __future__ import annotations
 
 import importlib
-import itertools
 import json
+import math
+import re
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,10 +29,11 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from sfa_localization.bags.decoding import IMU, ODOMETRY
-from sfa_localization.bags.reader import KINDS
-from sfa_localization.bags.recorder import BagRecorder
+from sfa_localization.bags.reader import KINDS, Bag
+from sfa_localization.bags.recorder import BagRecorder, recorded_files
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.data.errors import BagError, ConfigError, LocalizationError
+from sfa_localization.data.geometry import Array
 from sfa_localization.mapping.driven_ground import DrivenGround
 from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.nodes import conversions as convert
@@ -47,6 +50,8 @@ REACH_M = 1.0
 """Cells of the map, and the distance to an image within which `inspect` takes ground as covered."""
 _DEPTH_OF_QUEUE = 100
 _ENOUGH = 'enough to train on: call ~/finish'
+_FLAGS = {KINDS[name].flag: f"the parameter '{name}'" for name in ('image', 'odometry', 'imu')}
+"""Options of the commands, as this node names them."""
 
 
 class TeachNode(LocalizationNode):
@@ -76,15 +81,26 @@ class TeachNode(LocalizationNode):
         self._next_look_s = 0.0
         self._problem = ''
         self._said = ''
-        self._start(*self._pending()[-1:] or [self._new_drive()])
+        self._topics: dict[str, str] = {}
+        if self._untaught() or not self._model.exists():
+            self._start(next(reversed(self._drives()), self._drive(1)))
         latched = latched_qos()
         self._state = self.publisher(String, 'teach/state', latched)
         self._map = self.publisher(OccupancyGrid, 'teach/map', latched)
         self._hints = self.publisher(MarkerArray, 'teach/hints', latched)
+        self._offer_services()
+        self.every(1.0, self._step)
+
+    def _offer_services(self) -> None:
+        """Make services, and clients of the nodes early: to be found takes them a moment."""
         self.service(Trigger, '~/finish', self._finish)
         self.service(Trigger, '~/cancel', self._cancel)
         self.service(Trigger, '~/extend', self._extend)
-        self.every(1.0, self._step)
+        self._reload = self.client(Trigger, 'sfa_node/reload_model')
+        names = NODES if self.settings(TeachNodeConfig).localize else ()
+        self._chain = [self.client(ChangeState, f'{name}/change_state') for name in names]
+        self._waiting = list(self._chain) if self._model.exists() else []
+        self._is_new = bool(self._waiting)
 
     def teardown(self) -> None:
         if self._worker is not None:
@@ -99,26 +115,32 @@ class TeachNode(LocalizationNode):
 
     # Recording.
 
-    def _new_drive(self) -> Path:
-        """The folder of one more drive, beside the model."""
-        stem = self._model.stem
-        taken = {path.name for path in self._model.parent.glob(f'{stem}_*')}
-        numbers = itertools.count(1)
-        free = next(n for n in numbers if not taken & {f'{stem}_drive{n}', f'{stem}_trial{n}'})
-        return self._model.with_name(f'{stem}_drive{free}')
+    def _drive(self, number: int) -> Path:
+        """The folder of a drive, beside the model."""
+        return self._model.with_name(f'{self._model.stem}_drive{number}')
 
     def _drives(self) -> list[Path]:
-        """The folders that are there."""
-        folders = self._model.parent.glob(f'{self._model.stem}_drive*')
-        return sorted(folders, key=lambda path: (len(path.name), path.name))
+        """The folders that hold messages, in the order of their numbers."""
+        name = re.compile(re.escape(f'{self._model.stem}_drive') + '([0-9]+)')
+        matches = [name.fullmatch(path.name) for path in self._model.parent.glob('*')]
+        numbers = sorted(int(match[1]) for match in matches if match)
+        return [folder for folder in map(self._drive, numbers) if recorded_files(folder)]
 
-    def _pending(self) -> list[Path]:
-        """The folders that the model has not learned: they are newer."""
-        learned_s = self._model.stat().st_mtime if self._model.exists() else 0.0
-        return [path for path in self._drives() if path.stat().st_mtime > learned_s]
+    def _untaught(self) -> list[Path]:
+        """The drives that were recorded after the model was written."""
+        written_s = self._model.stat().st_mtime if self._model.exists() else 0.0
+        return [
+            folder
+            for folder in self._drives()
+            if recorded_files(folder)[-1].stat().st_mtime > written_s
+        ]
 
     def _start(self, folder: Path) -> None:
-        """Record into a folder, or go on there."""
+        """Record into a folder."""
+        self._findings = {}
+        self._problem = ''
+        with suppress(BagError), Bag(folder) as bag:  # of a new drive there is nothing to read
+            self._topics = {self._base(topic): topic for topic in bag.topics}
         self._recorder = BagRecorder(folder)
         self.get_logger().info(f'recording into {folder}')
 
@@ -133,23 +155,35 @@ class TeachNode(LocalizationNode):
 
     def _listen(self) -> None:
         """Subscribe to new inputs: images, each in one transport, odometry, IMUs, /tf_static."""
-        given = self.settings(TopicNames)
-        named = {given.image: '', given.odometry: '', given.imu: '', given.points_topic: ''}
+        named, types = self._wanted()
         bases = {self._base(topic) for topic in self._recorded}
-        for topic, kinds in sorted(self.get_topic_names_and_types(), reverse=True):
-            wanted = {*TRANSPORTS.values()} if not given.image else set()
-            wanted |= {ODOMETRY} if not given.odometry else set()
-            wanted |= {IMU} if not given.imu else set()
-            wanted |= {STATIC_TF} if topic.endswith('/tf_static') else set()
-            chosen = topic in named or (wanted & {*kinds} and not is_ours(self, topic))
-            if chosen and self._base(topic) not in bases and not topic.endswith(DEPTH):
-                bases.add(self._base(topic))
+        topics = sorted(self.get_topic_names_and_types(), reverse=True)
+        # A drive goes on in the transport of its beginning.
+        for topic, kinds in sorted(topics, key=lambda each: each[0] not in self._topics.values()):
+            wanted = types | ({STATIC_TF} if topic.endswith('/tf_static') else set())
+            base = self._base(topic)
+            chosen = base in named or (wanted & {*kinds} and not is_ours(self, topic))
+            if chosen and base not in bases and not topic.endswith(DEPTH):
+                bases.add(base)
                 self._record(topic, kinds[0])
+
+    def _wanted(self) -> tuple[set[str], set[str]]:
+        """The topics that parameters name, and the types of the inputs that they do not name."""
+        given = self.settings(TopicNames)
+        names = given.image, given.odometry, given.imu, given.points_topic
+        types = {*TRANSPORTS.values()} if not given.image else set()
+        types |= {ODOMETRY} if not given.odometry else set()
+        types |= {IMU} if not given.imu else set()
+        return {*map(self._full, names)}, types
 
     @staticmethod
     def _base(topic: str) -> str:
         """The name of a topic of images without its transport."""
         return topic.removesuffix('/compressed')
+
+    def _full(self, name: str) -> str:
+        """The full name of a topic of a parameter, without its transport; '' of none."""
+        return self._base(self.resolve_topic_name(name)) if name else ''
 
     def _record(self, topic: str, kind: str) -> None:
         """Subscribe to a topic as its publishers offer it."""
@@ -166,6 +200,7 @@ class TeachNode(LocalizationNode):
         if offered and all(each.durability is DurabilityPolicy.TRANSIENT_LOCAL for each in offered):
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
         write = partial(self._write, topic, kind)
+        self._topics[self._base(topic)] = topic
         self._recorded[topic] = self.subscribe(message_class, topic, write, qos, raw=True)
 
     def _write(self, topic: str, kind: str, data: bytes) -> None:
@@ -179,7 +214,7 @@ class TeachNode(LocalizationNode):
 
     def _fail(self, error: BagError) -> None:
         """Stop recording; what is recorded stays."""
-        self._problem = f'{error}: the recording ended'
+        self._problem = f'{error}: the recording ended; make room, then call ~/finish or ~/extend'
         self._recorder = None
         self.get_logger().error(self._problem)
 
@@ -199,15 +234,17 @@ class TeachNode(LocalizationNode):
             (self._trained if self._is_training else self._looked)(worker)
         elif self._worker is None and self._recorder is not None:
             self._look()
+        if self._is_new:
+            self._hand_over()
         self._say()
 
     def _commands(self, command: str, *words: str | Path) -> list[str | Path]:
         """A command with the topics and the parameter file of this node."""
         topics = self.settings(TopicNames)
         given = [
-            (KINDS[name].flag, getattr(topics, name))
+            (KINDS[name].flag, self._topics.get(self._full(getattr(topics, name)), ''))
             for name in ('image', 'odometry', 'imu')
-            if getattr(topics, name)
+            if self._full(getattr(topics, name)) in self._topics
         ]
         if self._config_file:
             given.append(('--config', self._config_file))
@@ -229,14 +266,19 @@ class TeachNode(LocalizationNode):
         share = self.settings(TeachNodeConfig).share
         self._next_look_s = steady_s() + worker.elapsed_s * (1 / share - 1)
         report = Path(self._folder.name) / 'report.json'
+        if self._recorder is None:
+            return
         if not report.exists():
-            self._problem = worker.last_line()
+            self._problem = self._words(worker.failure())
             return
         self._problem = ''
         (self._findings,) = json.loads(report.read_text())['bags']
         places = [np.array(drive) for drive in self._findings['drives'] if drive]
-        if not places:
-            return
+        if places:
+            self._show(places)
+
+    def _show(self, places: list[Array]) -> None:
+        """Publish the places (M, 3) of images of each part of the drive, and the ground covered."""
         frame = self.settings(TeachNodeConfig).odom_frame
         now_ns = self.get_clock().now().nanoseconds
         driven = np.concatenate(places)[:, :2]
@@ -249,92 +291,123 @@ class TeachNode(LocalizationNode):
     def _verdict(self) -> str:
         """The first reason why the drive is not enough, or that it is."""
         error = self._findings.get('error', '')
-        return next(iter([*filter(None, [error]), *self._findings.get('lacks', [])]), _ENOUGH)
+        lacks = filter(None, [error, *self._findings.get('lacks', [])])
+        return self._words(next(lacks, _ENOUGH))
+
+    @staticmethod
+    def _words(sentence: str) -> str:
+        """A sentence of a command, with the names of parameters in place of options."""
+        for flag, parameter in _FLAGS.items():
+            sentence = sentence.replace(flag, parameter)
+        return sentence.removeprefix('error: ')
+
+    def _troubles(self) -> list[str]:
+        """Which inputs have stopped, and which have several publishers."""
+        limit_s = self.settings(TeachNodeConfig).silence_timeout
+        sensors = [topic for topic in self._recorded if not topic.endswith('/tf_static')]
+        silent = [t for t in sensors if limit_s < self.monitors[t].silent_for_s() < math.inf]
+        names = {
+            topic: sorted(info.node_name for info in self.get_publishers_info_by_topic(topic))
+            for topic in sensors
+        }
+        return [f'nothing comes from {", ".join(sorted(silent))}'] * bool(silent) + [
+            f'{" and ".join(nodes)} publish on {topic}: end all but one'
+            for topic, nodes in names.items()
+            if len(nodes) > 1
+        ]
 
     def _say(self) -> None:
         """Publish one sentence when it is new."""
         if self._is_training and self._worker is not None:
-            said = f'training: {self._worker.last_line()}'
+            said = f'training: {self._words(self._worker.last_line()) or "starting"}'
         elif self._problem:
             said = self._problem
         elif self._recorder is None:
-            said = self._said
+            said = self._said or f'{self._model} is there: call ~/extend to drive more'
         elif not self._recorder.counts:
-            said = 'waiting for images and odometry'
+            drive = self._recorder.folder
+            earlier = f' to go on with {drive}' if drive in self._drives() else ''
+            said = f'waiting for images and odometry{earlier}'
         else:
-            driven = self._findings.get('facts', {}).get('drive', '')
-            known = [driven] if any(self._findings.get('drives', [])) else []
-            said = '; '.join([*known, self._verdict()])
-            said = said if self._findings else f'recording {", ".join(self._recorder.counts)}'
-        self._say_once(said)
+            recording = f'recording {", ".join(self._recorder.counts)}'
+            is_driven = any(self._findings.get('drives', []))
+            driven = self._findings['facts']['drive'] if is_driven else ''
+            judged = [driven, self._verdict()] if self._findings else [recording]
+            said = '; '.join(filter(None, [*self._troubles(), *judged]))
+        self._publish(said)
 
-    def _say_once(self, said: str) -> None:
+    def _publish(self, said: str) -> None:
         if said != self._said:
             self._said = said
             self._state.publish(String(data=said))
 
     def _finish(self, _: Any) -> str:
-        if self._recorder is None:
-            raise LocalizationError('nothing is being recorded: call ~/extend to drive more')
-        folder = self._recorder.folder
-        if not self._recorder.counts:
-            raise LocalizationError('nothing was recorded yet')
+        if self._is_training:
+            raise LocalizationError('training already, see teach/state')
+        recording = self._recorder is not None
+        if not (self._untaught() or (self._recorder and self._recorder.counts)):
+            advice = '' if recording else ': call ~/extend to drive more'
+            raise LocalizationError(f'nothing was recorded yet{advice}')
         if self._worker is not None:
             self._worker.stop()
+        words = self._commands('train')
         self._end_recording()
+        drives = self._untaught()
         update: list[str | Path] = ['--update', self._model] if self._model.exists() else []
         self._is_training = True
+        self._problem = ''
         outputs = '--output', self._model, '--json', self._judgment
-        self._start_worker(*self._commands('train', *self._pending(), *outputs, *update))
-        return f'recorded {folder}; training, see teach/state'
+        self._start_worker(*words, *drives, *outputs, *update)
+        return f'training on {", ".join(map(str, drives))}; see teach/state'
 
     def _cancel(self, _: Any) -> str:
+        if self._recorder is None and self._worker is None:
+            raise LocalizationError('nothing is being recorded or trained')
         if self._worker is not None:
             self._worker.stop()
             self._worker = None
         self._is_training = False
-        self._end_recording()
-        kept = []
-        for folder in self._pending():
-            kept.append(folder.with_name(folder.name.replace('_drive', '_trial')))
-            folder.rename(kept[-1])
         self._problem = ''
-        self._say_once(f'canceled; what was recorded is in {", ".join(map(str, kept))}')
+        self._end_recording()
+        kept = ', '.join(map(str, self._untaught()))
+        self._publish(f'canceled; {kept}: kept for ~/finish' if kept else 'canceled')
         return self._said
 
     def _extend(self, _: Any) -> str:
-        if self._recorder is not None or self._worker is not None:
+        if self._recorder is not None or self._is_training:
             raise LocalizationError('the last drive is not finished: call ~/finish or ~/cancel')
-        self._findings = {}
-        folder = self._new_drive()
-        self._start(folder)
-        return f'recording into {folder}'
+        last = next(reversed(self._drives()), None)
+        number = 1 + int(last.name.rpartition('_drive')[2]) if last else 1
+        self._start(self._drive(number))
+        return f'recording into {self._drive(number)}'
 
     def _trained(self, worker: Worker) -> None:
-        """Say how the training ended, and let the nodes use the model."""
+        """Say how the training ended; the nodes get the model as soon as they are there."""
         self._is_training = False
         if worker.code:
-            self._problem = f'training failed: {worker.last_line()}; the recording is kept'
-            self.get_logger().error(self._problem)
+            why = self._words(worker.failure())
+            self._problem = f'training failed: {why}; the recording is kept for ~/finish'
             return
-        self._problem = ''
         judgment = json.loads(self._judgment.read_text())
-        self._say_once(f'{self._model} is written. {judgment["sentence"]}')
+        self._publish(f'{self._model} is written. {judgment["sentence"]}')
         self.get_logger().info(self._said)
-        reload = self.client(Trigger, 'sfa_node/reload_model')
-        if self.settings(TeachNodeConfig).localize:
-            for name in NODES:
-                self._activate(name)
-        elif reload.service_is_ready():
-            reload.call_async(Trigger.Request())
+        self._waiting = list(self._chain)
+        self._is_new = True
 
-    def _activate(self, name: str) -> None:
+    def _hand_over(self) -> None:
+        """Let nodes that run reload the model; activate those that wait for it as they come."""
+        if self._reload.service_is_ready() and len(self._waiting) == len(self._chain):
+            self._reload.call_async(Trigger.Request())
+            self._is_new = False
+            return
+        for client in [client for client in self._waiting if client.service_is_ready()]:
+            self._activate(client)
+            self._waiting.remove(client)
+            self._is_new = bool(self._waiting)
+
+    def _activate(self, client: Any) -> None:
         """Configure a node, and activate it then."""
-        client = self.client(ChangeState, f'{name}/change_state')
         activate = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE))
         configure = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
-        if not client.service_is_ready():
-            self.refuse(name, 'is not there to be activated')
-            return
         done = client.call_async(configure)
         done.add_done_callback(lambda _: client.call_async(activate))

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -16,6 +17,16 @@ from sfa_localization.nodes.monitor import steady_s
 _NICE = 10
 _STOP_S = 5.0
 _LAST_BYTES = 2000
+_BOUND = f"""
+import ctypes, os, sys
+ctypes.CDLL(None).prctl(1, {int(signal.SIGTERM)})
+if os.getppid() != int(sys.argv.pop(1)):
+    sys.exit(1)
+from sfa_localization.cli import main
+sys.exit(main())
+"""
+"""Runs the command until the node ends, by any signal (PR_SET_PDEATHSIG): a node that is started
+again never meets the work of the one before."""
 
 
 class Worker:
@@ -24,7 +35,7 @@ class Worker:
     def __init__(self, words: Sequence[str | Path], log: Path) -> None:
         self.start_s = steady_s()
         self._log = log
-        command = [sys.executable, '-m', 'sfa_localization', *map(str, words)]
+        command = [sys.executable, '-c', _BOUND, str(os.getpid()), *map(str, words)]
         with log.open('wb') as output:
             self._process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
@@ -48,6 +59,14 @@ class Worker:
         text = self._log.read_bytes()[-_LAST_BYTES:].decode(errors='replace')
         lines = [line.strip() for line in text.replace('\r', '\n').split('\n')]
         return next(filter(None, reversed(lines)), '')
+
+    def failure(self) -> str:
+        """Why it failed: the signal that ended it, or what it printed last."""
+        if self.code is None or self.code >= 0:
+            return self.last_line()
+        name = signal.Signals(-self.code).name
+        memory = ', as by a system without memory' if name == 'SIGKILL' else ''
+        return f'{name} ended it{memory}'
 
     def stop(self) -> None:
         """End it, as a terminal does; what it wrote stays whole."""
