@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
@@ -105,7 +105,7 @@ def _several(arguments: argparse.Namespace) -> ReadingRecipe | None:
     from sfa_localization.bags.surround_drive import with_cameras
 
     bags = [path for path in arguments.images if _is_bag(path)]
-    if arguments.calibration or len(bags) != 1:
+    if arguments.calibration or _corrections(arguments) or len(bags) != 1:
         return None
     recipe = ReadingRecipe(topics=options.settings(TopicNames, arguments))
     recipe = with_cameras(bags[0], recipe)
@@ -136,6 +136,13 @@ def _check_several(arguments: argparse.Namespace, recipe: ReadingRecipe) -> int:
     return 0
 
 
+def _corrections(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What the command line says otherwise than a calibration file."""
+    from sfa_localization.camera.calibration import given_radii
+
+    return options.given(LensCalibration, arguments) | given_radii(arguments.radii)
+
+
 def _is_bag(path: Path) -> bool:
     return path.is_dir() or bool(_BAGS & set(path.suffixes))
 
@@ -144,10 +151,10 @@ def _lens(arguments: argparse.Namespace) -> tuple[LensCalibration, LearnedLens |
     """The lens of the calibration file, or the one that the drive shows."""
     from sfa_localization.bags.drives import ReadingRecipe
     from sfa_localization.bags.lens_drive import lens_of
-    from sfa_localization.camera.calibration import described, given_radii
+    from sfa_localization.camera.calibration import described
     from sfa_localization.camera.lens_report import sentence
 
-    given = options.given(LensCalibration, arguments) | given_radii(arguments.radii)
+    given = _corrections(arguments)
     if arguments.calibration:
         return described(arguments.calibration, given), None
     bags = [path for path in arguments.images if _is_bag(path)]
