@@ -26,8 +26,8 @@ FEWEST_CAMERAS = 2
 MOST_CAMERAS = 8
 BRIDGED_S = 3.0
 """Seconds for which the panorama may lack a camera, before that is a reason to doubt the pose."""
-_WATCHED = 2  # every second pixel shows a dark or frozen camera, at a quarter of the cost
 _RATES = 200  # of turns that are kept: those of a second or more
+_SAMPLED = 4  # every fourth pixel along each axis tells whether a camera is dark or frozen
 _SAME_POSE_NS = 100_000_000  # between the last pose and images whose pose it tells
 _NEAR_NS = 200_000_000  # an older rate of turn says nothing about an image
 
@@ -157,7 +157,7 @@ class Surround:
         problems = {
             name: problem
             for name, (_, image) in joined.images.items()
-            if (problem := self._watches[name].judge(image[::_WATCHED, ::_WATCHED]))
+            if (problem := self._watches[name].judge(image[::_SAMPLED, ::_SAMPLED]))
         }
         usable = {n: item for n, item in joined.images.items() if n not in problems}
         if not usable:  # a dark night, or a robot that stands: the panorama is judged as a whole
