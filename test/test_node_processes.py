@@ -18,7 +18,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import SetParameters
-from ros_bench import DEADLINE_S, start_process, until
+from ros_bench import DEADLINE_S, start_process
 from rosgraph_msgs.msg import Clock
 
 from sfa_localization.nodes.process import CANNOT_START, DIED
@@ -64,13 +64,15 @@ def test_what_rclpy_cannot_handle_itself_ends_nothing(bench, start):
         client = bench.node.create_client(kind, f'ekf_node/{service}')
         assert client.wait_for_service(DEADLINE_S)
         answers.append(client.call_async(request))
-    bench.publish('/clock', Clock(clock=Time(sec=-1)))
     told = bench.listen(DiagnosticArray, '/diagnostics')
 
     def reasons():
         return [v.key for m in told[-1:] for v in m.status[0].values if 'rclpy: refused' in v.key]
 
-    assert until(lambda: len(reasons()) + sum(answer.done() for answer in answers) == 3)
+    def handled():
+        return len(reasons()) + sum(answer.done() for answer in answers) == 3
+
+    assert bench.publish_until('/clock', Clock(clock=Time(sec=-1)), handled)
     assert not any(answer.result().success for answer in answers if answer.done())
     state = bench.call(GetState, 'ekf_node/get_state', GetState.Request()).current_state
     assert state.label == 'active'
