@@ -17,7 +17,7 @@ from launch_ros.actions import Node, PushROSNamespace
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-from sfa_localization.nodes.process import CANNOT_START, COMPOSED
+from sfa_localization.nodes.process import CANNOT_START, COMPOSED, is_true
 
 PACKAGE = 'sfa_localization'
 RESPAWN_DELAY_S = 2.0
@@ -86,7 +86,7 @@ def _nodes(context: LaunchContext) -> list:
     if not file.is_file():
         raise FileNotFoundError(f'{argument}:={file}: there is no such parameter file')
     # Without the argument, the parameter file decides.
-    start = {'autostart': _is_true(given, 'autostart')} if given['autostart'] else {}
+    start = {'autostart': is_true('autostart', given['autostart'])} if given['autostart'] else {}
     node = partial(_node, file, start)
     transport = {'image_transport': given['image_transport']}
     # Without the argument, the parameter file or the model decides.
@@ -98,7 +98,7 @@ def _nodes(context: LaunchContext) -> list:
     # As Nav2 does, so that robots with frames of the same names do not meet on /tf.
     odometry = [('odom', given['odom']), ('/tf', given['tf'])]
     static = [('/tf_static', f'{given["tf"]}_static')]
-    if _is_true(given, 'composed'):
+    if is_true('composed', given['composed']):
         if panorama or given['ekf'] != 'true':
             raise ValueError('composed:=true runs all nodes: leave panorama:= and ekf:= out')
         every = [*images, *odometry[1:], *static]
@@ -111,15 +111,6 @@ def _nodes(context: LaunchContext) -> list:
         seeing = [node('omnicam_node', images, several), node('sfa_node', static, model)]
     ekf = node('ekf_node', odometry, {}, condition=IfCondition(given['ekf']))
     return [PushROSNamespace(given['namespace']), *seeing, ekf, _rviz(given)]
-
-
-def _is_true(given: dict, argument: str) -> bool:
-    """An argument as ROS and Python write booleans. Raises ValueError for anything else."""
-    values = {'true': True, '1': True, 'false': False, '0': False}
-    text = given[argument]
-    if text.lower() not in values:
-        raise ValueError(f'{argument}:={text}: give true or false')
-    return values[text.lower()]
 
 
 def _rviz(given: dict) -> Node:

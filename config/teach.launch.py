@@ -15,6 +15,8 @@ from launch.substitutions import PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
+from sfa_localization.nodes.process import is_true
+
 PACKAGE = 'sfa_localization'
 
 
@@ -45,15 +47,14 @@ def _nodes(context: LaunchContext, config: PathJoinSubstitution) -> list:
     """The node that teaches, and the chain that waits for its model."""
     given = context.launch_configurations
     output = str(Path(given['output']).expanduser())
-    is_simulated = given['use_sim_time'].lower() in ('true', '1')
-    localize = given['localize'].lower() in ('true', '1')
+    localize = is_true('localize', given['localize'])
     parameters = {
         'output': output,
         'localize': localize,
         'image': given['image'],
         'odometry': given['odom'],
         'imu': given['imu'],
-        'use_sim_time': is_simulated,
+        'use_sim_time': is_true('use_sim_time', given['use_sim_time']),
     }
     teach = Node(
         package=PACKAGE,

@@ -21,7 +21,7 @@ from sfa_localization.data.errors import BagError
 from sfa_localization.data.files import write_bytes
 
 
-def recorded_files(folder: Path) -> list[Path]:
+def files_with_messages(folder: Path) -> list[Path]:
     """The files of a recorded drive that hold something."""
     return sorted(path for path in folder.glob('*.mcap') if path.stat().st_size)
 
@@ -43,7 +43,7 @@ class BagRecorder:
         self._stamps_ns: list[int] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._earlier = recorded_files(folder)
+            self._earlier = files_with_messages(folder)
             for path in {*folder.glob('*.mcap')} - {*self._earlier}:
                 path.unlink()
             self._path = folder / f'{folder.name}_{len(self._earlier)}.mcap'

@@ -10,7 +10,6 @@ from typing import Any
 from sfa_localization.bags import decoding
 from sfa_localization.bags.reader import Bag
 from sfa_localization.data.errors import MessageError
-from sfa_localization.data.geometry import Array
 from sfa_localization.data.transforms import TOPIC, TransformTree
 
 
@@ -19,21 +18,17 @@ class Frames:
 
     def __init__(self) -> None:
         self.of_topic = dict[str, str]()
-        self._tree = TransformTree()
+        self.tree = TransformTree()
         self.transforms = 0
 
     def add(self, topic: str, message: Any) -> None:
         """Take a message. Raises MessageError for transforms that are none."""
         if topic == TOPIC:
-            self._tree.add(message)
+            self.tree.add(message)
             self.transforms += 1
             return
         frame = getattr(message, 'child_frame_id', message.header.frame_id)
         self.of_topic[topic] = frame.lstrip('/')
-
-    def pose(self, sensor: str, base: str) -> Array | None:
-        """The pose (4, 4) of one frame in another; None where transforms do not connect them."""
-        return self._tree.pose(sensor, base)
 
 
 def lever_arm(bag: Bag, sensor_topic: str, odometry_topic: str) -> complex | None:
@@ -51,5 +46,4 @@ def lever_arm(bag: Bag, sensor_topic: str, odometry_topic: str) -> complex | Non
             break
     if len(frames.of_topic) < 2:
         return None
-    pose = frames.pose(frames.of_topic[sensor_topic], frames.of_topic[odometry_topic])
-    return None if pose is None else complex(*pose[:2, 3])
+    return frames.tree.lever(frames.of_topic[sensor_topic], frames.of_topic[odometry_topic])

@@ -175,7 +175,7 @@ class _Survey:
         return self._frames.of_topic.get(self._base) or BASE
 
     def _pose(self, topic: str) -> Any:
-        return self._frames.pose(self._frames.of_topic.get(topic, ''), self._robot)
+        return self._frames.tree.pose(self._frames.of_topic.get(topic, ''), self._robot)
 
     def camera(self, name: str, topic: str) -> MountedCamera:
         """The camera of a topic. Raises CameraError for a calibration that cannot be used."""

@@ -36,6 +36,7 @@ from sfa_localization.nodes.lifecycle import (
     OK,
     WARN,
     LocalizationNode,
+    TFMessage,
     latched_qos,
     sensor_qos,
 )
@@ -43,10 +44,6 @@ from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.saved_pose import SAVE_PERIOD_S, SavedPose, load_pose, save_pose
 from sfa_localization.nodes.settings import EkfNodeConfig
 
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:  # the pip wheels of ROS have none
-    TFMessage = None
 try:
     from nav2_msgs.srv import SetInitialPose
 except ImportError:  # without Nav2 nobody calls it

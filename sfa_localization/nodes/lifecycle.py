@@ -36,6 +36,11 @@ from sfa_localization.nodes.monitor import Monitor, steady_s
 from sfa_localization.nodes.process import CANNOT_START, DIED, SIGNALS
 from sfa_localization.nodes.settings import NodeConfig
 
+try:
+    from tf2_msgs.msg import TFMessage as TFMessage
+except ImportError:  # the pip wheels of ROS have none
+    TFMessage = None
+
 _PACKAGE = 'sfa_localization'
 DIAGNOSTICS_PERIOD_S = 1.0
 """Time between messages on /diagnostics: diagnostic_aggregator expects about one a second."""
@@ -60,6 +65,11 @@ def sensor_qos(depth: int = 5) -> QoSProfile:
 def latched_qos() -> QoSProfile:
     """Late subscribers receive the last message."""
     return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def static_qos() -> QoSProfile:
+    """Of /tf_static: each driver publishes once, and keeps its transforms for late subscribers."""
+    return QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class LocalizationNode(LifecycleNode):  # type: ignore[misc]

@@ -22,4 +22,14 @@ EXECUTABLES = {
 CANNOT_START = 1
 DIED = 2
 """Exit codes: a launch ends if a node cannot start, and restarts a node that died."""
+
+
+def is_true(argument: str, text: str) -> bool:
+    """An argument of a launch as ROS and Python write booleans. Raises ValueError otherwise."""
+    values = {'true': True, '1': True, 'false': False, '0': False}
+    if text.lower() not in values:
+        raise ValueError(f'{argument}:={text}: give true or false')
+    return values[text.lower()]
+
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM)

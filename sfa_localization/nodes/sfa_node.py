@@ -12,7 +12,6 @@ from typing import Any, cast
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, QuaternionStamped
 from nav_msgs.msg import OccupancyGrid
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -39,17 +38,14 @@ from sfa_localization.nodes.lifecycle import (
     OK,
     WARN,
     LocalizationNode,
+    TFMessage,
     latched_qos,
+    static_qos,
 )
 from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import SfaNodeConfig
 from sfa_localization.observer import Observation, Observer
 from sfa_localization.place_model import PlaceModel
-
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:  # the pip wheels of ROS have none
-    TFMessage = None
 
 _FEATURE_FRAME = 'slow_feature_space'
 _TURNED_FRAME = 'first_image'
@@ -84,7 +80,7 @@ class SfaNode(LocalizationNode):
         self._frames = TransformTree()
         self._camera_frame = ''
         if TFMessage is not None:
-            self.subscribe(TFMessage, TOPIC, self._frames.add, _static_qos())
+            self.subscribe(TFMessage, TOPIC, self._frames.add, static_qos())
         self._info = self.following('panorama/info')
         self.subscribe(String, self._info, self._receive_info, latched)
         transport = self._config.image_transport if self.takes_panoramas else 'raw'
@@ -229,11 +225,6 @@ class SfaNode(LocalizationNode):
         if explained < EXPLAINED_WARNING:
             return WARN, 'images are unlike those of training', values
         return OK, 'locating', values
-
-
-def _static_qos() -> QoSProfile:
-    """As tf2 listens: each driver publishes once, and keeps its transforms for those who join."""
-    return QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 @lru_cache(maxsize=1)

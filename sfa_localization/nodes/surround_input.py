@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo
 
 from sfa_localization.camera.calibration_files import calibration_of_info, read_calibration
@@ -29,18 +28,19 @@ from sfa_localization.data.run import Image
 from sfa_localization.data.transforms import TOPIC, TransformTree
 from sfa_localization.nodes.discovery import Discovery, without_transport
 from sfa_localization.nodes.image_input import ImageInput
-from sfa_localization.nodes.lifecycle import ERROR, OK, WARN, LocalizationNode, sensor_qos
-
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:  # the pip wheels of ROS have none
-    TFMessage = None
+from sfa_localization.nodes.lifecycle import (
+    ERROR,
+    OK,
+    WARN,
+    LocalizationNode,
+    TFMessage,
+    sensor_qos,
+    static_qos,
+)
 
 _ODOM = 'odom'
 _BASE = 'base_link'
 """The robot's frame, where odometry names none."""
-_STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Of /tf_static, which has a latched message of each of its publishers."""
 
 
 class Descriptions:
@@ -67,7 +67,7 @@ class Descriptions:
             described = self._node.subscribe(CameraInfo, info, take, sensor_qos(1), topic)
             self._subscriptions.append(described)
         if TFMessage is not None and self._topics.keys() - self._poses.keys():
-            transforms = self._node.subscribe(TFMessage, TOPIC, self._tree.add, _STATIC)
+            transforms = self._node.subscribe(TFMessage, TOPIC, self._tree.add, static_qos())
             self._subscriptions.append(transforms)
 
     def stop(self) -> None:

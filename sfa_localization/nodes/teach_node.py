@@ -30,14 +30,14 @@ from visualization_msgs.msg import MarkerArray
 
 from sfa_localization.bags.decoding import IMU, ODOMETRY
 from sfa_localization.bags.reader import KINDS, Bag
-from sfa_localization.bags.recorder import BagRecorder, recorded_files
+from sfa_localization.bags.recorder import BagRecorder, files_with_messages
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.data.errors import BagError, ConfigError, LocalizationError
 from sfa_localization.data.geometry import Array
 from sfa_localization.mapping.driven_ground import DrivenGround
 from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.nodes import conversions as convert
-from sfa_localization.nodes.discovery import DEPTH, is_ours
+from sfa_localization.nodes.discovery import DEPTH, is_ours, without_transport
 from sfa_localization.nodes.lifecycle import ERROR, OK, WARN, LocalizationNode, latched_qos
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.process import NODES
@@ -124,7 +124,7 @@ class TeachNode(LocalizationNode):
         name = re.compile(re.escape(f'{self._model.stem}_drive') + '([0-9]+)')
         matches = [name.fullmatch(path.name) for path in self._model.parent.glob('*')]
         numbers = sorted(int(match[1]) for match in matches if match)
-        return [folder for folder in map(self._drive, numbers) if recorded_files(folder)]
+        return [folder for folder in map(self._drive, numbers) if files_with_messages(folder)]
 
     def _untaught(self) -> list[Path]:
         """The drives that were recorded after the model was written."""
@@ -132,7 +132,7 @@ class TeachNode(LocalizationNode):
         return [
             folder
             for folder in self._drives()
-            if recorded_files(folder)[-1].stat().st_mtime > written_s
+            if files_with_messages(folder)[-1].stat().st_mtime > written_s
         ]
 
     def _start(self, folder: Path) -> None:
@@ -140,7 +140,7 @@ class TeachNode(LocalizationNode):
         self._findings = {}
         self._problem = ''
         with suppress(BagError), Bag(folder) as bag:  # of a new drive there is nothing to read
-            self._topics = {self._base(topic): topic for topic in bag.topics}
+            self._topics = {without_transport(topic): topic for topic in bag.topics}
         self._recorder = BagRecorder(folder)
         self.get_logger().info(f'recording into {folder}')
 
@@ -156,12 +156,12 @@ class TeachNode(LocalizationNode):
     def _listen(self) -> None:
         """Subscribe to new inputs: images, each in one transport, odometry, IMUs, /tf_static."""
         named, types = self._wanted()
-        bases = {self._base(topic) for topic in self._recorded}
+        bases = {without_transport(topic) for topic in self._recorded}
         topics = sorted(self.get_topic_names_and_types(), reverse=True)
         # A drive goes on in the transport of its beginning.
         for topic, kinds in sorted(topics, key=lambda each: each[0] not in self._topics.values()):
             wanted = types | ({STATIC_TF} if topic.endswith('/tf_static') else set())
-            base = self._base(topic)
+            base = without_transport(topic)
             chosen = base in named or (wanted & {*kinds} and not is_ours(self, topic))
             if chosen and base not in bases and not topic.endswith(DEPTH):
                 bases.add(base)
@@ -176,14 +176,9 @@ class TeachNode(LocalizationNode):
         types |= {IMU} if not given.imu else set()
         return {*map(self._full, names)}, types
 
-    @staticmethod
-    def _base(topic: str) -> str:
-        """The name of a topic of images without its transport."""
-        return topic.removesuffix('/compressed')
-
     def _full(self, name: str) -> str:
         """The full name of a topic of a parameter, without its transport; '' of none."""
-        return self._base(self.resolve_topic_name(name)) if name else ''
+        return without_transport(self.resolve_topic_name(name)) if name else ''
 
     def _record(self, topic: str, kind: str) -> None:
         """Subscribe to a topic as its publishers offer it."""
@@ -200,7 +195,7 @@ class TeachNode(LocalizationNode):
         if offered and all(each.durability is DurabilityPolicy.TRANSIENT_LOCAL for each in offered):
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
         write = partial(self._write, topic, kind)
-        self._topics[self._base(topic)] = topic
+        self._topics[without_transport(topic)] = topic
         self._recorded[topic] = self.subscribe(message_class, topic, write, qos, raw=True)
 
     def _write(self, topic: str, kind: str, data: bytes) -> None:
