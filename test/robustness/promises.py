@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the package does with each fault, and the test that shows it: a table of test/README.md.
+"""What the package does with each fault, and the test that shows it: a table of test/FAULTS.md.
 
 `PYTHONPATH=.:test python -m robustness --page` writes it after changes of this list.
 """
