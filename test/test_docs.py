@@ -156,6 +156,27 @@ def test_pages_are_of_the_version_and_date_of_the_recorded_results():
         assert f'<!-- {name} -->\n{text}<!-- end -->' in STUDIES, name
 
 
+def test_the_errors_on_the_first_page_are_those_of_the_other_tables():
+    results = json.loads(results_page.RECORD.read_text('utf-8'))['results']
+    half_real = re.findall(r'^\| half-real.* ([\d.]+) \| \d+% \|$', PAGES[EVALUATION], re.MULTILINE)
+    pairs = re.findall(
+        r'/ (\.\d+) \| \.\d+ / (\.\d+) \|$', PAGES['config/cameras.md'], re.MULTILINE
+    )
+    known, learned = (
+        sorted(f'0{error}' for error in column) for column in zip(*pairs, strict=True)
+    )
+    assert len(half_real) == len(known) == 4
+    shown = re.findall(
+        r'^\| (?:half-real|rendered).* \| ([^|]+) \|$', PAGES['README.md'], re.MULTILINE
+    )
+    assert shown == [
+        f'{results["demo"][0]["ekf"]["mean"]:.3f}',
+        re.search(r'sample_test \| [\d.]+ \| ([\d.]+)', PAGES[EVALUATION])[1],
+        f'{learned[0]}-{learned[-1]} / {known[0]}-{known[-1]}',
+        f'{min(half_real)}-{max(half_real)}',
+    ]
+
+
 def test_the_page_names_the_speeds_above_what_is_allowed():
     """And none that are not."""
     block = PAGES['test/README.md'].split('<!-- bench -->')[1].split('<!-- end -->')[0]
