@@ -25,7 +25,7 @@ $(READY): setup.py .ci/env
 demo: $(READY)  ## simulate, train, run the three nodes live, print the errors (about 5 minutes)
 	$(PY) -m sfa_localization demo $(ARGS)
 
-reproduce: $(READY)  ## the studies and the page test/EVALUATION.md: hours, which go on where they ended (ARGS=--quick)
+reproduce: $(READY)  ## the studies and their pages, test/EVALUATION.md and PAPER.md: hours, which go on where they ended (ARGS=--quick)
 	PYTHONPATH=.:test $(PY) -m study all $(ARGS)
 
 study: $(READY)  ## one of these studies, given or half-real bags, or the page (ARGS='baselines --quick'; ARGS=--help)

@@ -74,10 +74,9 @@ class PlaceModel:
     of merit of the training, `error_correlation` that of neighboring images, `rig` the robot, and
     `ground` where it drove. Map and keyframes hold places of the camera. The map reads `turned`
     maps, or slow features where there are none. Where the robot hides its view, pixels (H, W)
-    repeat those of `repeated`. `lens` is that of the camera, with its mounting, or None for
-    panoramas that were used as they are; `lean`, rad, are roll and pitch of the camera then, which
-    images show; () if there are none. The `surround` are the cameras whose images make a panorama,
-    if they are several.
+    repeat those of `repeated`. `lens` is that of the camera, with its mounting. It is None for
+    panoramas that were used as they are; `lean` is then roll and pitch of the camera, rad, if the
+    images showed them, else (). `surround` lists the cameras, if several make the panorama.
     """
 
     network: Network

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / 'test/README.md'
+PAGES = (ROOT / 'README.md', *sorted(ROOT.glob('test/*.md')))
 
 
 def markdown(header, rows):
@@ -18,9 +18,12 @@ def markdown(header, rows):
     return f'{head}{ruler}|\n{"".join(lines)}'
 
 
-def write_table(name, table, page=PAGE):
-    """Replace the table of this name on the page."""
+def write_table(name, table):
+    """Replace the table of this name on each page that has it, once."""
     mark = re.compile(rf'(<!-- {name} -->\n).*?(<!-- end -->\n)', re.DOTALL)
-    text, count = mark.subn(lambda match: match[1] + table + match[2], page.read_text('utf-8'))
-    assert count == 1, f'{page}: lacks <!-- {name} --> and <!-- end -->'
-    page.write_text(text, 'utf-8')
+    counts = []
+    for page in PAGES:
+        text, count = mark.subn(lambda match: match[1] + table + match[2], page.read_text('utf-8'))
+        page.write_text(text, 'utf-8')
+        counts.append(count)
+    assert max(counts) == 1, f'no page has <!-- {name} --> and <!-- end -->, or one has two'

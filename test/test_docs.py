@@ -38,10 +38,12 @@ PAGES = {
     for path in ROOT.glob(pattern)
 }
 EVALUATION = 'test/EVALUATION.md'
+STUDIES = PAGES[EVALUATION] + PAGES['test/PAPER.md']
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 BLOCK = re.compile(r'```(?:bash|sh)\n(.*?)```', re.DOTALL)
 INLINE = re.compile(r'`((?:sfa_localization|make) [^`]+)`')
-LINK = re.compile(r'\]\(([^)#\s]+)\)')
+LINK = re.compile(r'\]\(([^)\s]+)\)')
+HEADING = re.compile(r'^#+ (.+)$', re.MULTILINE)
 TOPIC = re.compile(r'\b((?:sfa|ekf)/[a-z_]+)\b')
 TOPIC_ROW = re.compile(r'^\| `/?([\w/]+)` \| (\w+) \|([^|]+)\|([^|]+)\|', re.MULTILINE)
 OTHER_TOPICS = re.compile(
@@ -137,21 +139,42 @@ def parameters():
 
 
 def topics():
-    """Return the topics in the table of config/README.md, which those of the nodes are."""
-    return {topic for topic, *_ in TOPIC_ROW.findall(PAGES['config/README.md'])}
+    """Return the topics in the table of config/topics.md, which those of the nodes are."""
+    return {topic for topic, *_ in TOPIC_ROW.findall(PAGES['config/topics.md'])}
 
 
 def test_pages_are_of_the_version_and_date_of_the_recorded_results():
-    """And test/EVALUATION.md shows these results: make study ARGS='page FOLDER'."""
-    record, evaluation = json.loads(results_page.RECORD.read_text('utf-8')), PAGES[EVALUATION]
+    """And those of studies show these results: make study ARGS='page FOLDER'."""
+    record = json.loads(results_page.RECORD.read_text('utf-8'))
     assert record['version'] == __version__
-    for name in ('README.md', 'test/README.md', EVALUATION):
+    for name in ('README.md', 'test/README.md', 'test/PAPER.md', EVALUATION):
         assert f'<!-- version -->\n{results_page.dated(record)}<!-- end -->' in PAGES[name], name
-    assert re.findall(r'20\d\d-\d\d-\d\d', evaluation) == [record['date']]
-    assert not re.search(r'(January|June|November|December) 20\d\d', evaluation)
+    assert set(re.findall(r'20\d\d-\d\d-\d\d', STUDIES)) == {record['date']}
+    assert not re.search(r'(January|June|November|December) 20\d\d', STUDIES)
     for name, table in results_page.tables(record['results']).items():
         text = table or results_page.UNMEASURED
-        assert f'<!-- {name} -->\n{text}<!-- end -->' in evaluation, name
+        assert f'<!-- {name} -->\n{text}<!-- end -->' in STUDIES, name
+
+
+def test_the_errors_on_the_first_page_are_those_of_the_other_tables():
+    results = json.loads(results_page.RECORD.read_text('utf-8'))['results']
+    half_real = re.findall(r'^\| half-real.* ([\d.]+) \| \d+% \|$', PAGES[EVALUATION], re.MULTILINE)
+    pairs = re.findall(
+        r'/ (\.\d+) \| \.\d+ / (\.\d+) \|$', PAGES['config/cameras.md'], re.MULTILINE
+    )
+    known, learned = (
+        sorted(f'0{error}' for error in column) for column in zip(*pairs, strict=True)
+    )
+    assert len(half_real) == len(known) == 4
+    shown = re.findall(
+        r'^\| (?:half-real|rendered).* \| ([^|]+) \|$', PAGES['README.md'], re.MULTILINE
+    )
+    assert shown == [
+        f'{results["demo"][0]["ekf"]["mean"]:.3f}',
+        re.search(r'sample_test \| [\d.]+ \| ([\d.]+)', PAGES[EVALUATION])[1],
+        f'{learned[0]}-{learned[-1]} / {known[0]}-{known[-1]}',
+        f'{min(half_real)}-{max(half_real)}',
+    ]
 
 
 def test_the_page_names_the_speeds_above_what_is_allowed():
@@ -164,21 +187,43 @@ def test_the_page_names_the_speeds_above_what_is_allowed():
     assert f'\nMore than allowed: {"; ".join(above) or "nothing"}.\n' in block
 
 
-def test_the_evaluation_is_short():
-    """Eight columns and 2,300 words at most, marks of tables included, as `wc -w` counts."""
-    rulers = re.findall(r'^\|(?:[ :-]+\|)+$', PAGES[EVALUATION], re.MULTILINE)
+def test_pages_are_short():
+    """1,800 words at most, the first page 1,500, as `wc -w` counts; tables have eight columns."""
+    words = {page: len(text.split()) for page, text in PAGES.items()}
+    assert {page: count for page, count in words.items() if count > 1800} == {}
+    assert words['README.md'] <= 1500
+    rulers = re.findall(r'^\|(?:[ :-]+\|)+$', STUDIES, re.MULTILINE)
     assert max(ruler.count('|') - 1 for ruler in rulers) <= 8
-    assert len(PAGES[EVALUATION].split()) <= 2300
+
+
+def test_lines_of_prose_fit_a_screen():
+    """130 columns; rows of tables, what programs wrote, and code are as long as they must be."""
+    long = {}
+    for page in PAGES.keys() - {'config/python.md'}:
+        text = re.sub(r'```.*?```|<!-- \w.*?<!-- end -->', '', PAGES[page], flags=re.DOTALL)
+        lines = [line for line in text.splitlines() if len(line) > 130 and line[0] != '|']
+        long |= {page: lines} if lines else {}
+    assert long == {}
+
+
+def anchors(text):
+    """The anchors that GitHub makes of the headings of a page."""
+    return {
+        re.sub(r'[^\w -]', '', name.lower()).replace(' ', '-') for name in HEADING.findall(text)
+    }
 
 
 def test_links_and_topics_exist():
-    broken = [
-        (page, target)
-        for page, text in PAGES.items()
-        for target in LINK.findall(text)
-        if not target.startswith('https://') and not (ROOT / page).parent.joinpath(target).exists()
-    ]
-    assert broken == []
+    links = [(page, target) for page, text in PAGES.items() for target in LINK.findall(text)]
+    broken = []
+    for page, target in links:
+        path, _, anchor = target.partition('#')
+        file = (ROOT / page).parent.joinpath(path) if path else ROOT / page
+        if not target.startswith('https://') and not (
+            file.exists() and (not anchor or anchor in anchors(file.read_text('utf-8')))
+        ):
+            broken.append((page, target))
+    assert len(links) > 50 and broken == []
     texts = [*PAGES.values(), (ROOT / 'config/localization.rviz').read_text('utf-8')]
     assert set(TOPIC.findall(''.join(texts))) <= topics()
 
@@ -209,7 +254,7 @@ def test_the_table_of_topics_is_that_of_the_nodes(bench, monkeypatch, tmp_path):
             if not OTHER_TOPICS.fullmatch(entity.topic_name)
         }  # fmt: skip
 
-    rows = TOPIC_ROW.findall(PAGES['config/README.md'])
+    rows = TOPIC_ROW.findall(PAGES['config/topics.md'])
     published = {row[:3] for row in rows if '_node' in row[2] and row[0] != 'tf'}
     read = {row[:2] + row[3:] for row in rows if '_node' in row[3] and row[0] != 'tf_static'}
     raw = {row for row in read if not row[0].endswith(('/compressed', '/ffmpeg', '/foxglove'))}
@@ -445,16 +490,17 @@ def test_the_reference_for_python_is_that_of_the_docstrings():
 
 
 def test_pages_name_tests_that_exist():
-    """And test/README.md shows the faults of promises.py."""
-    problems, faults = PAGES['config/problems.md'], PAGES['test/README.md']
+    """And test/FAULTS.md shows the faults of promises.py."""
+    problems, faults = PAGES['config/problems.md'], PAGES['test/FAULTS.md']
     assert promises.table() in faults, 'run: PYTHONPATH=.:test python -m robustness --page'
     names = TEST_NAME.findall(problems + faults)
     missing = [n for n in names if f'def {n[1]}(' not in (ROOT / 'test' / n[0]).read_text('utf-8')]
     assert len(names) > 50 and missing == []
 
 
-def test_each_reason_of_troubleshooting_is_in_the_code_with_cause_and_remedy():
-    lines = PAGES['config/troubleshooting.md'].splitlines()
+def test_each_reason_on_the_pages_is_in_the_code_with_cause_and_remedy():
+    reasons = PAGES['config/diagnostics.md'].partition('## Reasons')[2]
+    lines = (PAGES['config/troubleshooting.md'] + reasons).splitlines()
     rows = [row.strip('|').split('|') for row in lines if row.startswith('| `')]
     assert all(len(row) == 3 and all(cell.strip() for cell in row) for row in rows)
     code = ' '.join(path.read_text('utf-8') for path in (ROOT / 'sfa_localization').rglob('*.py'))

@@ -123,7 +123,7 @@ def test_every_measurement_gets_its_verdict(bench):
 
 
 def test_the_state_is_on_diagnostics_for_programs(bench):
-    """With the level, and the keys that config/problems.md names."""
+    """With the level, and the keys that config/diagnostics.md names."""
     drive = FilterDrive(twists=from_rest(winding(4)), **NOISY)
     node = bench.run(EkfNode, silence_timeout=60.0)
     states = bench.listen(String, 'ekf/state', latched_qos())
@@ -134,7 +134,7 @@ def test_the_state_is_on_diagnostics_for_programs(bench):
     assert until(lambda: states[-1].data.startswith('LOCALISED'))
     level, text, values = node.health()
     assert (level, text, values['state']) == (DiagnosticStatus.OK, 'LOCALISED', 'LOCALISED')
-    page = (ROOT / 'config/problems.md').read_text('utf-8')
+    page = (ROOT / 'config/diagnostics.md').read_text('utf-8')
     for key in values:
         kind, _, reason = key.partition(': ')
         assert f'`{kind}: REASON`' in page if reason else f'`{key}`' in page, key

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""One owner for each quantity and rule: the table of CONTRIBUTING.md is true; twins fail."""
+"""One owner for each quantity and rule: the table of test/OWNERS.md is true; twins fail."""
 
 import re
 
@@ -12,7 +12,7 @@ SOURCES = {
     path.relative_to(PACKAGE).as_posix(): path.read_text('utf-8') for path in PACKAGE.rglob('*.py')
 }
 ROW = re.compile(r'^\| ([^|]+) \| `([\w/]+\.py)` `(\w+)` \| [^|]+ \|$', re.MULTILINE)
-OWNERS = ROW.findall((ROOT / 'CONTRIBUTING.md').read_text('utf-8'))
+OWNERS = ROW.findall((ROOT / 'test/OWNERS.md').read_text('utf-8'))
 """Quantity, module and name of each row."""
 STATISTICS = {'data/statistics.py'}
 TWINS = {

@@ -175,7 +175,7 @@ def test_the_answer_about_a_drive_follows_its_figures(judged):
         assert evaluation.judgment(changed, counted)[0] == level
     for ratio, words in (
         (1.2, 'are right'),
-        (0.36, 'cautious: the errors are 0.60'),
+        (0.36, 'cautious: errors are 0.60 times the standard deviations'),
         (4.0, 'small'),
     ):
         sure = {**scores, 'ekf': {**scores['ekf'], 'nees': ratio, 'nees_right': [0.7, 1.4]}}

@@ -9,6 +9,7 @@ from functools import partial
 from unittest import mock
 
 import numpy as np
+import page_tables
 import pytest
 from places import lengths
 from study import __main__ as studies
@@ -107,13 +108,11 @@ def test_a_foreign_folder_and_results_of_other_settings_are_left_alone(tmp_path)
 
 
 def test_results_come_onto_the_page_once_and_only_of_this_version(tmp_path, monkeypatch):
-    for name in ('README', 'PAGE', 'RECORD'):
-        source = getattr(page, name)
-        monkeypatch.setattr(page, name, shutil.copy(source, tmp_path / f'{name}{source.suffix}'))
-    tests = tmp_path / 'test'
-    tests.mkdir()
-    shutil.copy(page.TESTS / 'README.md', tests)
-    monkeypatch.setattr(page, 'TESTS', tests)
+    monkeypatch.setattr(page, 'RECORD', shutil.copy(page.RECORD, tmp_path / 'record.json'))
+    pages = [
+        shutil.copy(source, tmp_path / f'{k}.md') for k, source in enumerate(page_tables.PAGES)
+    ]
+    monkeypatch.setattr(page_tables, 'PAGES', pages)
     monkeypatch.setattr(page, 'FIGURES', tmp_path)
     cell = {'log': 'a drive', 'plain': {'error_m': 0.0625, 'xy_within_95': 0.5}}
     cell['ours'] = {**cell['plain'], 'error_m': 0.03125}
@@ -122,7 +121,8 @@ def test_results_come_onto_the_page_once_and_only_of_this_version(tmp_path, monk
             tmp_path / 'real/real.json', {'settings': {'version': version}, 'cells': [cell]}
         )
         assert studies.main(['page', str(tmp_path / 'real')]) == code
-        assert page.PAGE.read_text('utf-8').count('| a drive | 0.062 | 50% | 0.031 | 50% |') == 1
+        written = ''.join(path.read_text('utf-8') for path in pages)
+        assert written.count('| a drive | 0.062 | 50% | 0.031 | 50% |') == 1
         kept = json.loads(page.RECORD.read_text('utf-8'))['results']['real']
         assert [other['log'] for other in kept].count('a drive') == 1
     (tmp_path / 'empty').mkdir()

@@ -130,16 +130,16 @@ def trust_lines(scores: Scores) -> list[str]:
     for name, row in scores.items():
         shares = {'positions': row.get('within_95'), 'headings': row.get('yaw_within_95')}
         inside = [f'{100 * share:.1f} % of {of}' for of, share in shares.items() if share]
-        parts = [f'regions of 95 % hold {" and ".join(inside)}'] if inside else []
+        parts = [f'the 95 % regions contain {" and ".join(inside)}'] if inside else []
         if row.get('nees') is not None:
             low, high = row['nees_right']
             parts.append(
-                f'squared errors are {row["nees"]:.2f} times the expected ones '
-                f'(on such a drive {low:.2f} to {high:.2f} where covariances are right)'
+                f'squared errors are {row["nees"]:.2f} times their variances '
+                f'({low:.2f} to {high:.2f} would be right on such a drive)'
             )
         best = row.get('similarity') or {}
         if best.get('mean') is not None:
-            parts.append(f'scaled by {best["scale"]:.4f} it errs by {best["mean"]:.3f} m')
+            parts.append(f'at the best scale, {best["scale"]:.4f}, it errs by {best["mean"]:.3f} m')
         if parts:
             lines.append(f'{_label(name)}: {"; ".join(parts)}')
     return lines
@@ -338,7 +338,7 @@ def _trust(row: Mapping[str, Any]) -> tuple[str, bool]:
         return 'but the covariances are too small.', False
     if ratio is None or expected is None or expected[0] <= ratio <= expected[1]:
         return 'and the covariances are right.', True
-    errors = f'the errors are {math.sqrt(ratio):.2f} times as large as they say.'
+    errors = f'errors are {math.sqrt(ratio):.2f} times the standard deviations.'
     if ratio < expected[0]:
         return f'and the covariances are cautious: {errors}', True
     return f'but the covariances are too small: {errors}', False

@@ -71,9 +71,7 @@ def _forecast_lines(quality: Mapping[str, Any]) -> list[str]:
         f'{worst["expected_error_m"]:.2f} m',
     ]
     if 'expected_yaw_error_deg' in quality:
-        lines.append(
-            f'heading: expect {quality["expected_yaw_error_deg"]:.1f} degrees mean error there'
-        )
+        lines.append(f'heading: expect {quality["expected_yaw_error_deg"]:.1f} degrees mean error')
     return lines
 
 

@@ -119,10 +119,11 @@ def weak_lines(trained: Trained) -> list[str]:
     ]
     even = f'Nowhere is the expected error more than {_WEAK} times the mean.'
     uneven = f'On {share:.0%} of the covered ground it is more than {_WEAK} times the mean.'
-    frame = 'x and y are those of the odometry where the first drive starts, or of start_pose.'
+    why = 'The usual reason: few images around it, as at the edge of the driven ground.'
+    frame = 'x and y are in the odometry frame of the first drive, or as start_pose moves it.'
     if trained.segments.points is not None:
         frame = 'x and y are those of the measured points.'
-    return [*lines, uneven if lines else even, frame]
+    return [*lines, *([uneven, why] if lines else [even]), frame]
 
 
 def trust_lines(trained: Trained) -> list[str]:
@@ -130,14 +131,14 @@ def trust_lines(trained: Trained) -> list[str]:
     quality = trained.model.quality
     angle = np.degrees(trained.metric.diagnostics.angle_std_rad)
     proven = (
-        'Proven: no other directions of the segments fit odometry and images better '
+        'Proven: no other directions of the pieces of the drive fit odometry and images better '
         if quality['certified']
-        else 'NOT proven: other directions of the segments may fit better '
+        else 'NOT proven: other directions of the pieces of the drive may fit better '
     )
     return [
         proven + f'(certificate {quality["certificate"]:.1e}, at least zero up to rounding).',
         f'Of the left-out images, {quality["left_out_within_95"]:.0%} lie in their 95 % region.',
-        f'The least certain direction of a segment is known to {angle:.1f} degrees.',
+        f'The direction of each piece of the drive is known to {angle:.1f} degrees or better.',
         'Not included: other light than in training, and a wrong wheel radius.',
     ]
 

@@ -92,7 +92,7 @@ def main():
         ('--frozen', 'the filter alone, by day and in the evening; writes test/README.md'),
         ('--means', 'the same; keep the mean errors, which test_faults.py lets get no worse'),
         ('--troubles', 'instead the troubles of recorded drives, with training: half an hour'),
-        ('--page', 'only write the faults of promises.py into test/README.md'),
+        ('--page', 'only write the faults of promises.py into test/FAULTS.md'),
         ('--record', 'locate all images anew: after training, features or keyframes change'),
     ):
         parser.add_argument(option, action='store_true', help=text)

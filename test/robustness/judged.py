@@ -134,7 +134,7 @@ def errors_table(verdicts):
               'right again after:']  # fmt: skip
     return markdown(header, rows) + (
         f'\nThe other {len(small)} faults err by at most {worst_m:.2f} m, and are never LOCALISED'
-        f' and wrong. Without any estimate: {", ".join(silent) or "none"}.\n'
+        f' and wrong. Faults without any estimate: {", ".join(silent) or "none"}.\n'
     )
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the package does with each fault, and the test that shows it: a table of test/README.md.
+"""What the package does with each fault, and the test that shows it: a table of test/FAULTS.md.
 
 `PYTHONPATH=.:test python -m robustness --page` writes it after changes of this list.
 """
@@ -58,7 +58,7 @@ PROMISES = {
     'test_a_sustained_offset_is_believed_in_the_end_but_no_images_in_disagreement':
         ('many images that contradict the estimate', 'overrule it only if they agree'),
     'test_pose_filter.py::test_a_cluster_of_wrong_images_after_an_outage_is_not_trusted_at_once':
-        ('wrong images after an outage', 'several must agree along the odometry'),
+        ('wrong images after an outage', 'used once several agree with the odometry'),
     'test_sfa_node.py::test_an_unusable_image_gives_no_pose_and_is_reported':
         ('a dark, covered or frozen camera', 'no pose, and the reason'),
     'test_surround_input.py::test_a_faulty_camera_is_hidden_and_named_until_it_is_back':
@@ -133,9 +133,9 @@ PROMISES = {
     'test_faults.py::test_the_filter_is_never_sure_and_wrong':
         ('each fault of `robustness/faults.py`', 'LOCALISED and wrong for 1.5 s at most'),
     'test_faults.py::test_no_fault_is_believed_for_long_or_makes_the_estimate_worse':
-        ('the same, the filter alone', 'mean errors no worse than recorded'),
+        ('the same, the filter alone', 'mean errors no worse than in a recorded run'),
     'test_faults.py::test_no_lie_is_believed_for_long':
-        ('faults fitted to contradict nothing at first', 'LOCALISED and wrong for 5 s at most'),
+        ('lies: they contradict no other input at first', 'LOCALISED and wrong for 5 s at most'),
     'test_faults.py::test_the_nodes_do_with_a_fault_what_the_localizer_does':
         ('each fault, through the three nodes', 'the same as `Localizer`'),
 }  # fmt: skip

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Make the tables and figures of test/EVALUATION.md; make half-real bags.
+"""Make the tables and figures of test/EVALUATION.md and PAPER.md; make half-real bags.
 
 PYTHONPATH=.:test python -m study all --quick
 PYTHONPATH=.:test python -m study simulator --seeds 5

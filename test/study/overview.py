@@ -77,9 +77,9 @@ def paper(results: Mapping[str, Cells]) -> tuple[list[Panel], str]:
     of_paper = 1 - PAPER['robot']['ekf'] / PAPER['robot']['odometry']
     return panels, (
         f"**The paper's experiments**, rendered, {count}: one image errs "
-        f'by {image[0]:.2f} and {image[1]:.2f} m; in the robot experiment the filter errs by '
-        f'{-gain:.0f} % less than the wheels, that of the paper, in its own garden, by '
-        f'{of_paper:.0%}.'
+        f'by {image[0]:.2f} and {image[1]:.2f} m. In the robot experiment the filter errs by '
+        f'{-gain:.0f} % less than the wheels. In its own garden the filter of the paper erred by '
+        f'{of_paper:.0%} less.'
     )
 
 
@@ -142,9 +142,9 @@ def camera(results: Mapping[str, Cells]) -> tuple[list[Panel], str]:
     _, measured, learned, ignored = series['EKF']
     groups = [case.replace(', ', '\n') for case in cases]
     return [Panel('place of the camera, and what the training knew of it', groups, series)], (
-        f'**Camera beside the axle**, rendered, {_gardens(results)}: 0.3 m ahead, the filter errs '
-        f'by {learned:.2f} m where the training learned its place, {measured:.2f} m where it was '
-        f'measured, {ignored:.2f} m where it was ignored.'
+        f'**Camera beside the axle**, rendered, {_gardens(results)}: with the camera 0.3 m ahead '
+        f'the filter errs by {learned:.2f} m if the training learned this, {measured:.2f} m if it '
+        f'was measured, and {ignored:.2f} m if it was ignored.'
     )
 
 

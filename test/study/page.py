@@ -35,7 +35,6 @@ from study.sites import FULL, ROUTES
 
 SUMMARY = 'put the results in these folders onto the pages'
 TESTS = Path(__file__).parents[1]
-README, PAGE = TESTS.parent / 'README.md', TESTS / 'EVALUATION.md'
 RECORD, FIGURES = TESTS / 'reproduced.json', TESTS / 'figures'
 FILES = {
     **{f'{name}.json': name for name in paper_tables.NAMES},
@@ -81,14 +80,11 @@ def update(folders: Sequence[Path]) -> int:
     if folders:
         record |= {'version': __version__, 'date': datetime.date.today().isoformat()}
         save_text(RECORD, _text(record))
-    for name, text in tables(record['results']).items():
-        write_table(name, text or UNMEASURED, PAGE)
-    for name, text in figures(record['results']).items():
-        write_table(name, text or UNMEASURED, PAGE)
-    for page in (README, TESTS / 'README.md', PAGE):
-        write_table('version', dated(record), page)
+    for name, text in (tables(record['results']) | figures(record['results'])).items():
+        write_table(name, text or UNMEASURED)
+    write_table('version', dated(record))
     if demo := record['results'].get('demo'):
-        write_table('demo', tables_of(demo[0]).partition('\n\n')[0] + '\n', README)
+        write_table('demo', tables_of(demo[0]).partition('\n\n')[0] + '\n')
     return 0
 
 
