@@ -144,8 +144,9 @@ def _from_starts(keyframes: Keyframes, image: UprightImage, pattern: Spectra | N
         spectrum = image.spectrum
         if pattern is not None:
             spectrum = spectrum - turned(pattern, -keyframes.sign * yaw)
+        changes = keyframes.changes(spectrum)
         for light in lights:
-            fit = keyframes.fit_about(spectrum, np.array([x, y]), yaw, light)
+            fit = keyframes.fit_about(changes, np.array([x, y]), yaw, light)
             likely.append(replace(fit, start=start))
     return likely
 
