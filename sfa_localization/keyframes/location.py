@@ -27,7 +27,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import special
 
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.keyframes.errors import ErrorModel
@@ -131,7 +130,8 @@ def _mixture(
     difference = slow[0] - places
     joint = evidence[:, None] + np.log(scales) - np.log(total)
     joint -= (difference**2).sum(1)[:, None] / (2 * total)
-    weight = special.softmax(joint)
+    weight = np.exp(joint - joint.max())
+    weight /= weight.sum()
     means = places[:, None] + gain[:, :, None] * difference[:, None]
     return weight, means, float((weight * by_keyframes * (1 - gain)).sum())
 
