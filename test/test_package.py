@@ -43,7 +43,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'camera': ({'data'}, NUMERIC | {'cv2', 'yaml', 'av'}),
     'sfa': ({'data', 'camera', 'keyframes'}, NUMERIC | {'cv2', 'mdp'}),
     'keyframes': ({'data', 'camera'}, NUMERIC | {'cv2'}),
-    'fusion': ({'data'}, NUMERIC | {'filterpy'}),
+    'fusion': ({'data'}, NUMERIC),
     'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'mcap', 'lz4', 'zstandard', 'yaml'}),
     'motion': ({'data', 'keyframes'}, NUMERIC),
     'metric': ({'data', 'keyframes', 'motion'}, NUMERIC),
@@ -239,7 +239,7 @@ MAIN = 'from sfa_localization import cli\ntry: cli.main({})\nexcept SystemExit: 
 @pytest.mark.parametrize(('code', 'unwanted'), [
     ('import sfa_localization', {'numpy', f'{NAME}.library', f'{NAME}.place_model'}),
     ('from sfa_localization import PlaceModel', {'mdp', 'rosbags', 'filterpy', 'matplotlib'}),
-    ('import sfa_localization.fusion.pose_filter', {'cv2', 'mdp', 'rosbags'}),
+    ('import sfa_localization.fusion.pose_filter', {'cv2', 'mdp', 'rosbags', 'scipy', 'filterpy'}),
     ('import sfa_localization.camera.panorama', {'scipy', 'filterpy', 'mdp', 'matplotlib'}),
     ('import sfa_localization.observer', {'scipy', 'filterpy', 'mdp', 'trimesh', 'rosbags'}),
     ('import sfa_localization.camera.rim_watch', {'scipy'}),
