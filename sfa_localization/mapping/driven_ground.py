@@ -81,10 +81,10 @@ class DrivenGround:
         corner = (np.floor(points.min(0) / size_m) - margin) * size_m
         column, row = np.unique(np.floor((points - corner) / size_m).astype(int), axis=0).T
         driven = np.zeros((row.max() + margin + 1, column.max() + margin + 1), bool)
-        up, aside = np.indices((2 * margin + 1,) * 2).reshape(2, -1) - margin
-        near = np.sqrt(up**2 + aside**2) * size_m <= reach_m
-        for above, beside in zip(up[near].tolist(), aside[near].tolist(), strict=True):
-            driven[row + above, column + beside] = True
+        offsets = np.indices((2 * margin + 1,) * 2).reshape(2, -1).T - margin
+        disc = offsets[np.hypot(*offsets.T) * size_m <= reach_m]
+        for up, right in disc.tolist():
+            driven[row + up, column + right] = True
         return Cells(driven, corner, size_m)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
