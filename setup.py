@@ -56,7 +56,6 @@ setup(
         'numpy>=1.26',
         'scipy>=1.11',
         'opencv-python-headless>=4.6',
-        'filterpy>=1.4.5',
         'rosbags>=0.11.3',
         # Bags that were cut off; it needs the next two, which bound what compressed bags become.
         'mcap>=1.2',
@@ -81,7 +80,7 @@ setup(
         # The workers of `fleet` on several machines.
         'fleet': ['dask>=2024.1', 'distributed>=2024.1'],
         # colcon finds the test runner by this name.
-        'test': ['pytest>=7.4', 'hypothesis>=6.82', 'psutil>=5.9'],
+        'test': ['pytest>=7.4', 'hypothesis>=6.82', 'psutil>=5.9', 'filterpy>=1.4.5'],
         'dev': ['ruff==0.17.5', 'mypy==2.4.1', 'types-PyYAML', 'pytest-xdist>=3.3'],
     },
     entry_points={

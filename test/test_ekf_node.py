@@ -148,6 +148,19 @@ def test_the_state_is_on_diagnostics_for_programs(bench):
     assert float(values['/odom: latency p99 [ms]']) >= float(values['/odom: latency p50 [ms]']) > 0
 
 
+@pytest.mark.parametrize('topic', ['panorama/troubles', 'sfa/troubles'])
+def test_what_other_nodes_find_of_the_cameras_is_a_reason_until_it_is_mended(bench, topic):
+    drive = FilterDrive(twists=from_rest(winding(4)), **NOISY)
+    node = bench.run(EkfNode, silence_timeout=60.0)
+    states = bench.listen(String, 'ekf/state', latched_qos())
+    play(bench, node, drive)
+    assert until(lambda: states[-1].data.startswith('LOCALISED'))
+    bench.publish(topic, String(data='camera left: silent'), latched_qos())
+    assert until(lambda: states[-1].data == 'DEGRADED: camera left: silent')
+    bench.publish(topic, String(), latched_qos())
+    assert until(lambda: states[-1].data.startswith('LOCALISED'))
+
+
 def test_initialpose_and_set_pose_set_the_pose(bench):
     drive = FilterDrive(seconds=1)
     node = bench.run(EkfNode, silence_timeout=0.1, lost_std=0.5, degraded_std=0.4)

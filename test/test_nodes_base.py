@@ -113,7 +113,7 @@ def test_what_ros2_param_dumps_can_be_loaded(bench, tmp_path):
     assert sum(node.describe_parameter(name).read_only for name in names) == len(names) > 10
     values = {name: node.get_parameter(name).value for name in names}
     path.write_text(yaml.safe_dump({'/echo': {'ros__parameters': values}}))
-    for name, told in parameter_dict_from_yaml_file(str(path)).items():
+    for name, told in parameter_dict_from_yaml_file(str(path), False, ['/echo']).items():
         assert node.set_parameters([Parameter.from_parameter_msg(told)])[0].successful, name
     both = [Parameter('autostart', value=value) for value in (True, False)]
     assert 'autostart' in node.set_parameters_atomically(both).reason

@@ -222,6 +222,18 @@ def test_the_replay_of_the_readme_becomes_localised(bench, start, model):
     interrupted(chain)
 
 
+def test_a_camera_that_static_transforms_have_elsewhere_is_named_by_the_state(bench, start, model):
+    frames = '--frame-id', 'base_link', '--child-frame-id', 'camera'
+    start('run', 'tf2_ros', 'static_transform_publisher', '--x', '1.0', '--y', '0.5', *frames)
+    chain = launch(start, f'model:={model}', 'image_transport:=compressed')
+    heard = states(bench)
+    assert until(lambda: bench.node.count_subscribers('/image_raw/compressed'), COMMAND_S)
+    played(start, DRIVE, '--remap', '/panorama/compressed:=/image_raw/compressed')
+    moved = '/tf_static has the camera 1.00 m ahead and 0.50 m left of base_link'
+    assert any(moved in state.data for state in heard), heard[-1].data
+    interrupted(chain)
+
+
 @pytest.mark.parametrize(('argument', 'reasons'), [
     ('config:=/none.yaml', ['config:=/none.yaml: there is no such parameter file']),
     ('params_file:=/none.yaml', ['params_file:=/none.yaml: there is no such parameter file']),

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from filter_drives import NOISY, SECOND, START_NS, FilterDrive, fed, snapshot, started, winding
+from filterpy.kalman import ExtendedKalmanFilter
 from numpy.testing import assert_allclose
 from places import distances
 
@@ -17,7 +18,7 @@ from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import integrate
-from sfa_localization.fusion.ekf import Ekf, replaced
+from sfa_localization.fusion.ekf import Ekf, Kalman, replaced
 from sfa_localization.fusion.health import MISSING
 from sfa_localization.fusion.motion import DELAY, LOSS, SCALE, SIZE, Pace, Twist
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
@@ -278,6 +279,22 @@ def test_a_delay_that_turns_contradict_gives_way_and_the_pose_follows():
 
 
 # Consistency; see also test_filter_consistency.py.
+
+
+@pytest.mark.parametrize('size', [2, 3])
+def test_an_update_is_that_of_filterpy(size):
+    reference, rng = ExtendedKalmanFilter(SIZE, size), np.random.default_rng(size)
+    root, jacobian = rng.normal(size=(SIZE, SIZE)), rng.normal(size=(size, SIZE))
+    blank = Ekf(FilterConfig(), ErrorCorrelation()).blank(SECOND)
+    belief = blank._replace(mean=0.1 * rng.normal(size=SIZE), covariance=root @ root.T)
+    z, noise = 0.1 * rng.normal(size=size), np.diag(rng.uniform(0.1, 1.0, size))
+    reference.x, reference.P = belief.mean, belief.covariance
+    reference.update(z, lambda _: jacobian, jacobian.dot, noise)
+    reference.x[2] = wrap_angle(reference.x[2])
+    d2 = reference.y @ reference.SI @ reference.y
+    expected = reference.x, reference.P, reference.y, reference.S, d2
+    for ours, theirs in zip(Kalman().corrected(belief, z, jacobian, noise), expected, strict=True):
+        assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
 
 
 def test_standing_still_neither_drifts_nor_becomes_overconfident():

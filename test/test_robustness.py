@@ -173,7 +173,7 @@ def test_of_odometry_that_comes_too_fast_the_newest_is_used_and_said_to_be_behin
     free.set()
     last = START_NS + 399 * 2_000_000
     assert until(lambda: node.filter.state.stamp_ns == last)
-    assert until(lambda: any('DEGRADED: behind by 1.' in state.data for state in states))
+    assert until(lambda: any('DEGRADED: behind by ' in state.data for state in states))
     assert node.filter.waited_s > 1.0, 'what comes late shows no clock'
     assert 'LOST' not in {state.data.partition(':')[0] for state in states}
     odometry = node.monitors['odom']

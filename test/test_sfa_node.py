@@ -136,6 +136,7 @@ def test_a_camera_that_static_transforms_have_elsewhere_is_named(bench, models):
     rig = Rig(camera_ahead=Quantity(0.3, 0.01), camera_left=Quantity(-0.1, 0.01))
     models['a.npz'].rig = rig
     node = bench.run(SfaNode, model='a.npz', base_frame='robot')
+    troubles = bench.listen(String, 'sfa/troubles', latched_qos())
     bench.publish('panorama', message())
     assert until(lambda: node.health()[1] == 'locating')
     for x_m, said in ((0.31, ''), (0.62, 'has the camera 0.62 m ahead and -0.10 m left of')):
@@ -146,6 +147,8 @@ def test_a_camera_that_static_transforms_have_elsewhere_is_named(bench, models):
     broken = SimpleNamespace(transforms=[transform('mast', 'omnicam', math.nan, 0.0)])
     node.take('/tf_static', node._frames.add, broken)
     assert 'was it moved?' in node.health()[1] and node.monitors['/tf_static'].used == 2
+    bench.publish('panorama', message(seed=2))
+    assert until(lambda: troubles and troubles[-1].data == node.health()[1])
 
 
 def test_an_unusable_image_gives_no_pose_and_is_reported(bench, models):

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -33,10 +34,10 @@ def lens_of(bag: Path, recipe: ReadingRecipe, progress: bool = False) -> Learned
     drive does not show the lens.
     """
     try:
+        if _shows_panoramas(bag, recipe):
+            return None
         stamps_ns, odometry = _stamps(bag, recipe)
         samples = _samples(bag, recipe, stamps_ns)
-        if looks_like_panorama(*samples[0].shape[:2]):
-            return None
         guess = LensGuess.of(samples)
         stretches = chosen_images(stamps_ns, odometry)
         tracker = PointTracker(guess.cameras, samples)
@@ -44,6 +45,13 @@ def lens_of(bag: Path, recipe: ReadingRecipe, progress: bool = False) -> Learned
         return learn_lens(tracks, odometry, guess, samples)
     except CameraError as error:
         raise CameraError(f'{bag}: {error}') from None
+
+
+def _shows_panoramas(bag: Path, recipe: ReadingRecipe) -> bool:
+    """Whether the first image is one."""
+    with Bag(bag, config=recipe.bag) as opened:
+        shapes = (image.shape[:2] for _, image in opened.images(recipe.topics.image))
+        return any(looks_like_panorama(*shape) for shape in islice(shapes, 1))
 
 
 def _stamps(bag: Path, recipe: ReadingRecipe) -> tuple[Stamps, Trajectory]:

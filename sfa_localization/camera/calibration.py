@@ -14,7 +14,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from sfa_localization.camera.calibration_files import CALIBRATION_TITLE, read_calibration
 from sfa_localization.camera.lenses import make_camera
@@ -178,6 +177,8 @@ def _clearness(bright: Array, dark: Array, contrast: float) -> Array:
 
 def _values(cue: Array, points: Complex, order: int) -> Array:
     """Values of a cue at points, column + i row, by splines of an order; NaN outside of it."""
+    from scipy.ndimage import map_coordinates  # for images of mirrors alone
+
     rows_columns = [points.imag, points.real]
     return np.asarray(map_coordinates(cue, rows_columns, float, order=order, cval=np.nan))
 

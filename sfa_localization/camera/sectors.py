@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from sfa_localization.camera.lenses import OPTICAL_AXES, turned_camera
 from sfa_localization.camera.panorama import (
@@ -304,6 +303,8 @@ def _arc(seen: Mask) -> Indices:
 
 def _margin_deg(visible: Mask, panorama: PanoramaConfig) -> Array:
     """How far (H, W), in degrees, pixels lie inside what is visible (H, W)."""
+    from scipy.ndimage import distance_transform_edt  # for several cameras alone
+
     if visible.all():
         return np.full(visible.shape, 180.0)
     width = visible.shape[1]

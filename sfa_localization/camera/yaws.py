@@ -18,7 +18,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from sfa_localization.camera.sectors import MountedCamera, Part, SurroundView
 from sfa_localization.camera.settings import PanoramaConfig
@@ -117,6 +116,8 @@ def pairs(stamps_ns: Stamps, poses: Array, second: int | None = None) -> list[tu
     """Numbers of images at stamps (N,) and poses (N, 3) that show one place in two headings, the
     nearest first, each image at most twice; or those whose `second` image is given.
     """
+    from scipy.spatial import cKDTree  # for several cameras alone
+
     first, other = cKDTree(poses[:, :2]).query_pairs(_WITHIN_M, output_type='ndarray').T
     turned = np.abs(wrap_angle(poses[first, 2] - poses[other, 2])) > _TURNED_RAD
     soon = np.abs(stamps_ns[first] - stamps_ns[other]) < WITHIN_NS

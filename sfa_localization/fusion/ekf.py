@@ -8,12 +8,12 @@ Each is a pure function, so that late events can be placed where they belong: se
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.data.geometry import Array, compose, relative, wrap_angle
+from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import (
@@ -58,34 +58,39 @@ ALIKE_SHARE = 0.2
 """Where neighbors share less of their errors, positions are those of a sensor without outliers."""
 
 
-class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
-    """The equations as pure functions, the update by filterpy, which keeps the last innovation."""
+class Correction(NamedTuple):
+    """A belief's `mean` (14,) and `covariance` (14, 14) after a measurement, and its `innovation`
+    (M,) with covariance (M, M) and squared Mahalanobis distance `d2`.
+    """
 
-    def __init__(self) -> None:
-        super().__init__(SIZE, 3)
+    mean: Array
+    covariance: Array
+    innovation: Array
+    innovation_covariance: Array
+    d2: float
+
+
+class Kalman:
+    """The equations of the extended Kalman filter as pure functions."""
 
     def predicted(self, belief: Belief, step: Step) -> Array:
         """Covariance (14, 14) after a prediction: F P F^T + Q."""
         return step.jacobian @ belief.covariance @ step.jacobian.T + step.noise
 
-    def corrected(
-        self, belief: Belief, z: Array, jacobian: Array, noise: Array
-    ) -> tuple[Array, Array, float]:
-        """Mean (14,), covariance (Joseph form) and squared Mahalanobis distance of the innovation,
-        which stays in `y`, its covariance in `S`.
-        """
-        self.x = belief.mean
-        self.P = belief.covariance
-        self.update(z, lambda _: jacobian, lambda x: jacobian @ x, noise, residual=_innovation)
-        self.x[YAW] = wrap_angle(self.x[YAW])
-        return self.x, self.P, float(self.y @ self.SI @ self.y)
-
-
-def _innovation(z: Array, predicted: Array) -> Array:
-    """With its angle wrapped."""
-    difference = z - predicted
-    difference[YAW:] = wrap_angle(difference[YAW:])
-    return difference
+    def corrected(self, belief: Belief, z: Array, jacobian: Array, noise: Array) -> Correction:
+        """The belief after a measurement z (M,), with the covariance in Joseph form."""
+        innovation = z - jacobian @ belief.mean
+        innovation[YAW:] = wrap_angle(innovation[YAW:])
+        common = jacobian @ belief.covariance
+        innovation_covariance = common @ jacobian.T + noise
+        solved = np.linalg.solve(innovation_covariance, np.column_stack([common, innovation]))
+        gain = solved[:, :SIZE].T
+        mean = belief.mean + gain @ innovation
+        mean[YAW] = wrap_angle(mean[YAW])
+        rest = np.eye(SIZE) - gain @ jacobian
+        covariance = rest @ belief.covariance @ rest.T + gain @ noise @ gain.T
+        d2 = float(innovation @ solved[:, SIZE])
+        return Correction(mean, covariance, innovation, innovation_covariance, d2)
 
 
 class Ekf:
@@ -201,8 +206,11 @@ class Ekf:
 
     def _moved(self, belief: Belief, stamp_ns: int, step: Step) -> Belief:
         """Apply a prediction to mean, covariance, dead reckoning and the distance traveled."""
-        moved = relative(belief.mean[:3], step.mean[:3])
-        x, y, yaw = compose(np.array(belief.dead_reckoned), moved).tolist()
+        dx, dy, turn = (step.mean[:3] - belief.mean[:3]).tolist()
+        x, y, yaw = belief.dead_reckoned
+        c = math.cos(yaw - belief.mean[YAW])
+        s = math.sin(yaw - belief.mean[YAW])
+        reckoned = x + c * dx - s * dy, y + s * dx + c * dy, float(wrap_angle(yaw + turn))
         images = belief.memory.images
         oldest_ns = images[0].stamp_ns if images else stamp_ns
         predicted = self._kalman.predicted(belief, step) if belief.located else belief.covariance
@@ -210,9 +218,9 @@ class Ekf:
             stamp_ns=stamp_ns,
             mean=step.mean,
             covariance=predicted,
-            dead_reckoned=(x, y, yaw),
-            traveled_m=belief.traveled_m + math.hypot(*moved[:2]),
-            path=belief.path.driven(stamp_ns, (x, y, yaw), oldest_ns),
+            dead_reckoned=reckoned,
+            traveled_m=belief.traveled_m + math.hypot(dx, dy),
+            path=belief.path.driven(stamp_ns, reckoned, oldest_ns),
         )
 
     # Update.
@@ -250,14 +258,15 @@ class Ekf:
         """Accept what lies inside the gate, with less weight where it is outlying; reject what lies
         outside, or restart where the rejected images outweigh the estimate.
         """
-        kalman = self._kalman
         memory = belief.memory
         size = event.value.size
         z, jacobian, white = self._linearized(belief, event)
-        mean, covariance, d2 = kalman.corrected(belief, z, jacobian, white)
+        corrected = self._kalman.corrected(belief, z, jacobian, white)
+        d2 = corrected.d2
         inside = d2 <= GATE[size]
         reason = 'accepted' if inside else 'outside the gate'
-        update = Update(event.stamp_ns, inside, d2, GATE[size], reason, kalman.y, kalman.S)
+        innovation = corrected.innovation, corrected.innovation_covariance
+        update = Update(event.stamp_ns, inside, d2, GATE[size], reason, *innovation)
         if not inside:
             place = relocate(images, self._correlation.distance_m) if len(images) > 1 else None
             if place is not None and place.outweighs(belief):
@@ -266,9 +275,10 @@ class Ekf:
             return belief._replace(memory=rejected)
         outlying = d2 / OUTLYING[size]
         if outlying > 1 and self._correlation.share >= ALIKE_SHARE:
-            mean, covariance, _ = kalman.corrected(belief, z, jacobian, white * outlying**2)
+            corrected = self._kalman.corrected(belief, z, jacobian, white * outlying**2)
         images = (*images[:-1], images[-1]._replace(accepted=True))
         memory = Memory(memory.support + 1, 0, event.stamp_ns, images, update)
+        mean, covariance = corrected[:2]
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
 
     def _linearized(self, belief: Belief, event: MeasurementEvent) -> tuple[Array, Array, Array]:
@@ -329,6 +339,7 @@ def _fix(belief: Belief, event: MeasurementEvent) -> PositionFix:
     """A measurement beside the pose by dead reckoning; the uncertain delay adds variance."""
     moving = motion.velocity(belief.mean)[: len(event.value)]
     variances = event.covariance.diagonal() + moving**2 * belief.covariance[DELAY, DELAY]
+    x_variance, y_variance, *yaw_variance = variances.tolist()
     x, y, *yaw = event.value.tolist()
     counted_ns = belief.odometry.stamp_ns
     limit_ns = round(ODOMETRY_TIMEOUT_S * 1e9)
@@ -336,8 +347,8 @@ def _fix(belief: Belief, event: MeasurementEvent) -> PositionFix:
         event.stamp_ns,
         complex(x, y),
         yaw[0] if yaw else math.nan,
-        float(variances[:2].mean()),
-        float(variances[2]) if yaw else math.inf,
+        (x_variance + y_variance) / 2,
+        yaw_variance[0] if yaw else math.inf,
         belief.dead_reckoned,
         belief.traveled_m,
         is_reckoned=counted_ns is not None and event.stamp_ns - counted_ns <= limit_ns,

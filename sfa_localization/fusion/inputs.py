@@ -27,7 +27,7 @@ _UNKNOWN_STDS = np.array([POSITION_STD, POSITION_STD, 0.2])  # m, m, rad
 # Least standard deviations: drivers understate what encoders resolve (m/s, rad/s), and no map from
 # images is better everywhere (m, m, rad).
 _LEAST_TWIST_STDS = (0.01, 0.005)
-_LEAST_STDS = np.array([0.05, 0.05, 0.02])
+_LEAST_VARIANCES = np.square([0.05, 0.05, 0.02])
 # Twists, some seconds of them, of which so many are repeated by odometry that repeats commands:
 # 0.66 to 0.82 on four small robots.
 _COMMANDS = 200
@@ -105,13 +105,11 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
     if not matrix.any():
         matrix = np.diag(_UNKNOWN_STDS[: pose.size] ** 2)
     matrix = _positive(matrix)
-    variances = matrix.diagonal()
-    if variances[:2].max() >= LARGEST_VARIANCE:
+    if matrix.diagonal()[:2].max() >= LARGEST_VARIANCE:
         raise DataError('covariance means that nothing is known')
     noise = factor * matrix
-    least = np.square(_LEAST_STDS[: pose.size])
-    np.fill_diagonal(noise, np.maximum(factor * variances, least))
-    return pose, _positive(noise)
+    np.fill_diagonal(noise, np.maximum(noise.diagonal(), _LEAST_VARIANCES[: pose.size]))
+    return pose, noise
 
 
 def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:

@@ -146,9 +146,9 @@ class Twist(NamedTuple):
         return abs(self.v) >= STANDSTILL_SPEED or abs(self.omega) >= STANDSTILL_RATE
 
     @property
-    def covariance(self) -> Array:
-        """Of v and omega (2, 2)."""
-        return np.diag([self.v_variance, self.omega_variance])
+    def variances(self) -> Array:
+        """Of v and omega (2,)."""
+        return np.array(self[2:])
 
 
 class Pace(NamedTuple):
@@ -224,7 +224,7 @@ def drive(
     by_twist = step.jacobian[:BIAS, V:BIAS].copy()
     step.jacobian[:BIAS, V:BIAS] = 0.0
     step.jacobian[:BIAS, BIAS:DELAY] = by_twist @ by_errors
-    step.noise[:BIAS, :BIAS] += by_twist @ twist.covariance @ by_twist.T
+    step.noise[:BIAS, :BIAS] += by_twist * twist.variances @ by_twist.T
     if now is not None:
         by_errors = _by_errors(mean, now)
         step.mean[V:BIAS] = now[:2] + by_errors @ mean[BIAS:DELAY]
@@ -293,9 +293,13 @@ def _advance(
     meters = abs(v) * dt
     radians = abs(omega) * dt
     fade = math.exp(-(meters + TURN_RADIUS_M * radians) / noise.decorrelation_m)
-    after = np.array([*(mean[:3] + moved), v, omega, *mean[BIAS:ERROR], *(fade * mean[ERROR:])])
+    kept = np.ones(SIZE)
+    kept[ERROR:] = fade
+    after = kept * mean
+    after[:3] += moved
     after[YAW] = wrap_angle(after[YAW])
-    jacobian = np.diag([1.0] * ERROR + [fade] * 3)
+    after[V:BIAS] = v, omega
+    jacobian = np.diag(kept)
     jacobian[:2, YAW] = -moved[1], moved[0]
     jacobian[:3, V:BIAS] = by_twist
     slip = noise.slip_per_meter**2 * meters
@@ -306,8 +310,8 @@ def _advance(
     # dt it moves the pose as a constant error of variance (variance * time / dt) would.
     # test_errors_of_readings_do_not_average_out_with_the_rate_of_messages
     if dt > 0:
-        lasting = ODOMETRY_CORRELATION_S / dt * twist.covariance
-        added[:3, :3] += by_twist @ lasting @ by_twist.T
+        lasting = ODOMETRY_CORRELATION_S / dt * twist.variances
+        added[:3, :3] += by_twist * lasting @ by_twist.T
     return Step(after, jacobian, added)
 
 

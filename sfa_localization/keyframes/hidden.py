@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sfa_localization.data.geometry import Array, Mask
 from sfa_localization.keyframes.texture import Spectra, Texture, channels, columns_of, spectrum
@@ -58,6 +57,8 @@ def completed(spectra: Spectra, seen: Mask, places: Array) -> Spectra:
     """Spectra (K, rows, F) of textures at one heading with their missing parts filled in, by masks
     (K, rows, columns) and places (K, 2) m. What no neighbor saw is 0.
     """
+    from scipy.spatial import cKDTree  # for training alone
+
     textures = columns_of(spectra, seen.shape[2]) * seen
     whole = textures.copy()
     tree = cKDTree(places)

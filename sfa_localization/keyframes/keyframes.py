@@ -114,7 +114,7 @@ class Keyframes:
 
     def aligned(self, rows: Any) -> Spectra:
         """The spectra (M, rows, F) of some keyframes, turned to yaw 0."""
-        parts = self.values[rows].astype(np.float32) * np.float32(self.step)
+        parts = np.multiply(self.values[rows], np.float32(self.step), dtype=np.float32)
         return np.asarray(parts.view(np.complex64).swapaxes(1, 2))
 
     @cached_property
@@ -163,23 +163,28 @@ class Keyframes:
         added = nearest[~self.first[nearest] & (distance[nearest] <= reach)][:NEIGHBORS]
         return np.sort(np.concatenate([of_light, added]))
 
-    def fit_about(self, image: Spectra, place: Array, yaw: float, light: int) -> Fit:
-        """Locate the spectrum (rows, F) of an image by the keyframes of one light around a place
-        (2,) m; repeat around the result if that is far away.
-        """
-        fit = self.fit(image, yaw, self.around(place, light))
-        if np.hypot(*(fit.place - place)) > _NEAR_M:
-            fit = self.fit(image, fit.yaw, self.around(fit.place, light))
-        return fit
-
-    def fit(self, image: Spectra, yaw: float, rows: Indices) -> Fit:
-        """Where the spectrum (rows, F) of an image with about this yaw rad is among some keyframes.
-
-        Changes of the image by roll, pitch and heading are projected out, and estimated.
+    def changes(self, image: Spectra) -> Spectra:
+        """The spectrum (rows, F) of an image, and its derivatives by roll, pitch and heading: (4,
+        rows, F).
         """
         slopes = spectrum(derivatives(columns_of(image, self.columns), self.channels, self.sphere))
         by_turn = image * (1j * np.arange(image.shape[1])).astype(np.complex64)
-        changes = turned(np.concatenate([image[None], slopes, by_turn[None]]), self.sign * yaw)
+        return np.concatenate([image[None], slopes, by_turn[None]])
+
+    def fit_about(self, changes: Spectra, place: Array, yaw: float, light: int) -> Fit:
+        """Locate an image with its `changes` (4, rows, F) by the keyframes of one light around a
+        place (2,) m; repeat around the result if that is far away.
+        """
+        fit = self.fit(changes, yaw, self.around(place, light))
+        if np.hypot(*(fit.place - place)) > _NEAR_M:
+            fit = self.fit(changes, fit.yaw, self.around(fit.place, light))
+        return fit
+
+    def fit(self, changes: Spectra, yaw: float, rows: Indices) -> Fit:
+        """Where an image with about this yaw rad is among some keyframes, by its `changes` (4,
+        rows, F): those by roll, pitch and heading are projected out, and estimated.
+        """
+        changes = turned(changes, self.sign * yaw)
         keyframes = self.aligned(rows)
         if self.seen is not None:
             seen = turned_mask(self.seen, self.sign * yaw)

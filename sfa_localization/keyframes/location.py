@@ -27,7 +27,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import special
 
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.keyframes.errors import ErrorModel
@@ -131,7 +130,8 @@ def _mixture(
     difference = slow[0] - places
     joint = evidence[:, None] + np.log(scales) - np.log(total)
     joint -= (difference**2).sum(1)[:, None] / (2 * total)
-    weight = special.softmax(joint)
+    weight = np.exp(joint - joint.max())
+    weight /= weight.sum()
     means = places[:, None] + gain[:, :, None] * difference[:, None]
     return weight, means, float((weight * by_keyframes * (1 - gain)).sum())
 
@@ -144,8 +144,9 @@ def _from_starts(keyframes: Keyframes, image: UprightImage, pattern: Spectra | N
         spectrum = image.spectrum
         if pattern is not None:
             spectrum = spectrum - turned(pattern, -keyframes.sign * yaw)
+        changes = keyframes.changes(spectrum)
         for light in lights:
-            fit = keyframes.fit_about(spectrum, np.array([x, y]), yaw, light)
+            fit = keyframes.fit_about(changes, np.array([x, y]), yaw, light)
             likely.append(replace(fit, start=start))
     return likely
 

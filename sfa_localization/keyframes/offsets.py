@@ -68,7 +68,7 @@ def find_offsets(views: Textures, poses: Array, sphere: Sphere) -> Offsets:
         near = near[~views.near(row, near)][:NEIGHBORS]
         if len(near) < FEWEST:
             continue
-        fit = keyframes.fit(keyframes.spectrum(row), poses[row, 2], near)
+        fit = keyframes.fit(keyframes.changes(keyframes.spectrum(row)), poses[row, 2], near)
         if fit.unlike < _UNLIKE:
             missing = (0, NEIGHBORS - len(near))  # filled up with neighbors of no share
             others = np.pad(near, missing, constant_values=near[0])

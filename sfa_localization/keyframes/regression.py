@@ -95,17 +95,16 @@ def regress(
     """
     count = len(keyframes)
     heights = [part.stop - part.start for part in channels]
-    spectra = np.concatenate([keyframes, image])
-    products = _products(spectra, channels, columns)
+    textures = _Textures.of(keyframes, image, channels, columns)
+    products = textures.products()
     basis = _Basis.of(products[:, count, :count].sum(axis=0), lights, places)
     gains = basis.gains(products)
-    scale = np.ones((len(channels), len(spectra)))
+    scale = np.ones(products.shape[:2])
     scale[:, count:] /= gains[:, None]
     products *= scale[:, :, None] * scale[:, None]
     trust = _trust(gains, products, basis, heights)
     combinations, shares, unlike = _regression(np.tensordot(trust, products, 1), basis)
-    by_row = np.repeat(combinations[:, None] * scale, heights, axis=1).astype(np.float32)
-    residual, *directions = np.einsum('crn,nrf->crf', by_row, spectra, optimize=True)
+    residual, *directions = textures.combined(combinations * scale[:, None])
     trust_of_rows, gain_of_rows = np.repeat([trust, gains], heights, axis=1).astype(np.float32)
     variance = _variance(residual, directions, trust_of_rows, columns)
     place = shares @ places
@@ -115,17 +114,38 @@ def regress(
     return Fit(place, shares, changes, unlike, residual, variance, outward)
 
 
+@dataclass(frozen=True, slots=True)
+class _Textures:
+    """The real spectra (n, 2 h F) of n textures in each channel of h rows, times the `norm` (F,)
+    with which their products are those of textures.
+    """
+
+    channels: list[Texture]
+    norm: Texture
+
+    @classmethod
+    def of(
+        cls, keyframes: Spectra, image: Spectra, channels: Sequence[slice], columns: int
+    ) -> _Textures:
+        once = 2 * np.arange(image.shape[2]) % columns == 0
+        norm = np.sqrt(np.where(once, 1, 2) / columns).astype(np.float32)
+        both = (np.concatenate([keyframes[:, part], image[:, part]]) * norm for part in channels)
+        return cls([part.reshape(len(part), -1).view(np.float32) for part in both], norm)
+
+    def products(self) -> Array:
+        """Products (C, n, n) by channel."""
+        return np.stack([part @ part.T for part in self.channels]).astype(float)
+
+    def combined(self, shares: Array) -> Spectra:
+        """Spectra (M, rows, F) of combinations with shares (C, M, n) of each channel."""
+        parts = map(np.matmul, shares.astype(np.float32), self.channels)
+        spectra = np.concatenate(list(parts), axis=1).view(np.complex64)
+        return np.asarray(spectra.reshape(len(spectra), -1, len(self.norm)) / self.norm)
+
+
 def _outward(offset: Array) -> float:
     """`Fit.outward` of a place from which keyframes lie at an offset (N, 2) m."""
     return float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
-
-
-def _products(spectra: Spectra, channels: Sequence[slice], columns: int) -> Array:
-    """Products (C, n, n) of n textures by channel, of their spectra (n, rows, F)."""
-    once = 2 * np.arange(spectra.shape[2]) % columns == 0
-    weighted = spectra * np.sqrt(np.where(once, 1, 2) / columns).astype(np.float32)
-    parts = (weighted[:, part].reshape(len(spectra), -1).view(np.float32) for part in channels)
-    return np.stack([part @ part.T for part in parts]).astype(float)
 
 
 @dataclass(frozen=True, slots=True)

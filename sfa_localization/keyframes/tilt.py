@@ -14,8 +14,10 @@ by a sine of its azimuth.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
@@ -78,32 +80,40 @@ def find_tilt(
     fine = np.stack(
         [part.start + np.arange(rows) * (part.stop - part.start) // rows for part in channels]
     )
-    level = columns_of(turned(others, turn)[:, fine], columns)
+    level = columns_of(turned(others, turn), columns)[:, fine]
     row_rad = (sphere.high - sphere.low) / rows
     most = max(min(round(float(_LARGEST) / row_rad), rows // 2 - 1), 1)
-    steps = np.arange(-most, most + 1)
-    by_step = _by_step(columns_of(image[fine], columns), level, most)
-    azimuth = sphere.azimuths(columns)[:, None, None]
-    shift = np.clip(steps * np.cos(azimuth) - steps[:, None] * np.sin(azimuth), -most, most)
-    # Linear between two whole rows: (columns, steps, rolls, pitches).
-    weights = np.maximum(1 - np.abs(shift[:, None] - steps[:, None, None]), 0)
-    scores = np.tensordot(by_step, weights.astype(np.float32), 2)
-    scores -= (_UNLIKELY * row_rad**2 * np.add.outer(steps**2, steps**2)).astype(np.float32)
+    by_step = _by_step(columns_of(image, columns)[fine], level, most)
+    scores = np.tensordot(by_step, _moves(sphere, columns, most), ((0, 2), (0, 1)))
+    squares = np.square(np.arange(-most, most + 1))
+    scores -= (_UNLIKELY * row_rad**2 * np.add.outer(squares, squares)).astype(np.float32)
     return row_rad * (_peaks(scores) - most), scores.max((1, 2))
 
 
+@lru_cache(maxsize=4)
+def _moves(sphere: Sphere, columns: int, most: int) -> Texture:
+    """How much of each column moves up by -most to most rows by tilts of so many: (columns, steps,
+    rolls, pitches), linear between two whole rows; read-only.
+    """
+    steps = np.arange(-most, most + 1)
+    azimuth = sphere.azimuths(columns)[:, None, None]
+    shift = np.clip(steps * np.cos(azimuth) - steps[:, None] * np.sin(azimuth), -most, most)
+    distance = np.abs(shift[:, None] - steps[:, None, None])
+    weights = np.asarray(np.maximum(1 - distance, 0), np.float32)
+    weights.setflags(write=False)
+    return weights
+
+
 def _by_step(image: Texture, level: Texture, most: int) -> Texture:
-    """Correlations (M, columns, steps) of the columns of an image (C, rows, columns), moved up by
+    """Correlations (columns, M, steps) of the columns of an image (C, rows, columns), moved up by
     -most to most rows, with those of M level ones (M, C, rows, columns).
     """
-    rows = image.shape[1]
+    count, _, rows, columns = level.shape
     padded = np.pad(image, ((0, 0), (most, most), (0, 0)))
-    by_step = []
-    for step in range(-most, most + 1):
-        moved = padded[:, most - step : most - step + rows]
-        overlap = np.sqrt(rows / (rows - abs(step)))
-        by_step.append(overlap * np.einsum('mhrc,hrc->mc', level, moved))
-    return np.stack(by_step, axis=2).astype(np.float32)
+    moved = sliding_window_view(padded, rows, axis=1)[:, ::-1].transpose(2, 0, 3, 1)
+    overlap = np.sqrt(rows / (rows - np.abs(np.arange(-most, most + 1)))).astype(np.float32)
+    by_column = level.reshape(count, -1, columns).transpose(2, 0, 1)
+    return np.asarray(by_column @ moved.reshape(columns, -1, len(overlap)) * overlap)
 
 
 def _peaks(scores: Texture) -> Array:

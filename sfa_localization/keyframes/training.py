@@ -97,8 +97,9 @@ def fit_among(keyframes: Keyframes, row: int, among: NDArray[np.bool_]) -> Fit |
     if scores[best] < LIKE_A_PLACE:
         return None
     place = others.poses[best, :2]
+    changes = others.changes(image)
     fits = [
-        others.fit_about(image, place, float(yaws[best]), light)
+        others.fit_about(changes, place, float(yaws[best]), light)
         for light in others.likeliest_lights(scores)
     ]
     return min(fits, key=lambda fit: fit.unlike, default=None)

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.spatial import Delaunay, QhullError
 
 from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.mapping.settings import GroundConfig
@@ -39,6 +37,8 @@ class Cells:
 
     def enclosed(self, places: Array) -> Mask:
         """The cells (H, W) inside the convex hull of places (P, 2) m."""
+        from scipy.spatial import Delaunay, QhullError  # for drives that are taught alone
+
         row, column = np.indices(self.driven.shape)
         centers = self.corner + self.size_m * (np.stack([column, row], axis=-1) + 0.5)
         try:
@@ -79,10 +79,13 @@ class DrivenGround:
         points = np.concatenate([self.places, between.reshape(-1, 2)])
         margin = int(np.ceil(reach_m / size_m)) + 1
         corner = (np.floor(points.min(0) / size_m) - margin) * size_m
-        column, row = np.floor((points - corner) / size_m).astype(int).T
-        away = np.ones((row.max() + margin + 1, column.max() + margin + 1), bool)
-        away[row, column] = False
-        return Cells(ndimage.distance_transform_edt(away) * size_m <= reach_m, corner, size_m)
+        column, row = np.unique(np.floor((points - corner) / size_m).astype(int), axis=0).T
+        driven = np.zeros((row.max() + margin + 1, column.max() + margin + 1), bool)
+        offsets = np.indices((2 * margin + 1,) * 2).reshape(2, -1).T - margin
+        disc = offsets[np.hypot(*offsets.T) * size_m <= reach_m]
+        for up, right in disc.tolist():
+            driven[row + up, column + right] = True
+        return Cells(driven, corner, size_m)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to save."""

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, optimize, signal
+from scipy import ndimage, optimize
 from scipy.sparse import csr_array
 
 from sfa_localization.data.errors import DataError
@@ -217,6 +217,8 @@ class _Comparison:
             for at, places in ((self.track_s, self.wheels), (self.seconds, self.places))
         )
         true = true.conj() if mirrored else true
+        from scipy import signal  # takes long to import
+
         behind = int(np.argmax(np.abs(signal.correlate(true, by_wheels)))) - len(by_wheels) + 1
         return float(self.seconds[0] - self.track_s[0]) + _STEP_S * behind
 

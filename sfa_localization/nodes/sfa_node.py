@@ -75,6 +75,8 @@ class SfaNode(LocalizationNode):
         self._map = self.publisher(OccupancyGrid, 'sfa/map', latched)
         self._paths = self.publisher(MarkerArray, 'sfa/map_paths', latched)
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
+        self._troubles = self.publisher(String, 'sfa/troubles', latched)
+        self._told_troubles = ''
         self.service(Trigger, '~/reload_model', self._reload)
         self._declared: PanoramaConfig | None = None
         self._frames = TransformTree()
@@ -167,9 +169,17 @@ class SfaNode(LocalizationNode):
         lever = self._frames.lever(self._camera_frame, self._config.base_frame)
         return '' if lever is None else self._observer.model.rig.displaced(lever)
 
+    def _tell_troubles(self) -> None:
+        """Publish where the camera is otherwise than in training, if that has changed."""
+        problem = self._camera_problem()
+        if problem != self._told_troubles:
+            self._told_troubles = problem
+            self._troubles.publish(String(data=problem))
+
     def _locate(self, stamp_ns: int, image: Image, frame: str) -> None:
         assert self._observer is not None
         self._camera_frame = frame
+        self._tell_troubles()
         model = self._observer.model
         if problem := self._declared_problem(model.panorama):
             raise MessageError(problem)

@@ -178,8 +178,7 @@ def folded(solution: LinearSfa) -> tuple[Weights, Weights]:
 
 def expand(z: Map) -> Map:
     """All monomials of degree 1 and 2 of signals (L, ...): (L + L (L + 1) / 2, ...)."""
-    i, j = np.triu_indices(len(z))
-    return np.concatenate([z, z[i] * z[j]])
+    return np.concatenate([z, *(z[i] * z[i:] for i in range(len(z)))])
 
 
 def input_map(images: Image, architecture: Architecture) -> Map:
@@ -233,9 +232,8 @@ def _gray(image: Image) -> Map:
 
 def _per_panorama(image: Image) -> Map:
     """Zero mean and unit scale of each channel over the whole image: independent of exposure."""
-    pixels = np.asarray(image, np.float32)
-    scale = np.maximum(pixels.std((0, 1)), 1)
-    return np.asarray((pixels - pixels.mean((0, 1))) / scale, np.float32)
+    mean, std = (row.astype(np.float32).ravel() for row in cv2.meanStdDev(image))
+    return np.asarray((image - mean) / np.maximum(std, 1), np.float32)
 
 
 _NORMALIZATIONS = {
@@ -248,7 +246,7 @@ NORMALIZATIONS = tuple(_NORMALIZATIONS)
 
 def linear_stage(below: Map, receptive: Field, linear: Weights, offset: Weights) -> Map:
     """First half of a layer: reduced signals (L, rows, R) of one map (rows, R, channels)."""
-    reduced = unfold(below[None], receptive)[0] @ linear - offset
+    reduced = np.tensordot(unfold(below[None], receptive)[0], linear, 1) - offset
     return np.asarray(np.moveaxis(reduced, -1, 0), np.float32)
 
 
@@ -272,7 +270,7 @@ class Network:
         above = []
         for below in maps:  # the monomials of all images at once would need much memory
             reduced = linear_stage(below, receptive, node.linear, node.linear_offset)
-            slow = np.moveaxis(expand(reduced), 0, -1) @ node.slow - node.slow_offset
+            slow = np.tensordot(expand(reduced), node.slow, (0, 0)) - node.slow_offset
             above.append(np.clip(slow, -layer.clip, layer.clip))
         return np.stack(above)
 

@@ -1,10 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The three nodes as processes: `python bench_chain.py MODEL.npz BAG [SECONDS]`.
+"""The nodes as processes: `python bench_chain.py FOLDER MODEL.npz BAG [SECONDS]`.
 
-Measures the latency from an image to its pose, the share of a core at 10 and at 30 images a second
-beside 50 odometry messages, the same with several cameras beside one, and the CPU time and memory
-of a node until it is active.
+Runs the package that lies in the folder, of any version. Measures the latency from an image to its
+pose, the share of a core at 10 and at 30 images a second beside 50 odometry messages, the same in
+one process, and with several cameras beside one, and time and memory until nodes are active.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ NAMESPACE = '/bench'
 
 
 def start_node(name, *parameters, **options):
-    """The process of a node."""
+    """The process of a node; `cwd` is the folder of the package, if it is another version."""
     words = ['--ros-args', '-r', f'__ns:={NAMESPACE}', *(w for p in parameters for w in ('-p', p))]
     return start_process('-m', 'sfa_localization', name, *words, **options)
 
@@ -141,22 +141,27 @@ class Shuttle(Driver):
         return np.array([np.interp(place, fp=column, **turns) for column in self.poses.T])
 
 
-def parameters_of(model: PlaceModel, path: Path | str) -> dict[str, list[str]]:
-    """Return the parameters of each node, for images that are the model's panoramas."""
-    size = model.panorama
+def parameters_of(path: Path | str) -> dict[str, list[str]]:
+    """Return the parameters of each node, for images that are the panoramas of any model."""
+    with np.load(path) as arrays:
+        size = json.loads(str(arrays['header']))['panorama']
+    names = 'width', 'height', 'elevation_min', 'elevation_max'
     return {
-        'omnicam_node': ['camera_model:=panorama', f'width:={size.width}',
-                         f'height:={size.height}', f'elevation_min:={size.elevation_min}',
-                         f'elevation_max:={size.elevation_max}'],
+        'omnicam_node': ['camera_model:=panorama', *(f'{name}:={size[name]}' for name in names)],
         'sfa_node': [f'model:={Path(path).resolve()}'],
         'ekf_node': [],
-    }  # fmt: skip
+    }
+
+
+def composed(parameters: dict[str, list[str]]) -> dict[str, list[str]]:
+    """Return the same for all nodes in one process."""
+    return {'localization': [word for words in parameters.values() for word in words]}
 
 
 @contextmanager
-def running(parameters: dict[str, list[str]]) -> Iterator[list[Any]]:
+def running(parameters: dict[str, list[str]], **options: Any) -> Iterator[list[Any]]:
     """Start the nodes, and end them; yields their processes."""
-    processes = [start_node(name, *p) for name, p in parameters.items()]
+    processes = [start_node(name, *p, **options) for name, p in parameters.items()]
     try:
         yield processes
     finally:
@@ -170,12 +175,13 @@ def cpu_s(processes: list[Any]) -> float:
     return float(sum(spent.user + spent.system for spent in times))
 
 
-def bench_nodes(path: Path, bag: Path, seconds: float = 8.0) -> dict[str, float]:
-    """Share of a core at 10 and 30 images a second, and the latency at 30, in ms."""
-    parameters = parameters_of(PlaceModel.load(path), path)
+def bench_nodes(
+    package: Path, parameters: dict[str, list[str]], bag: Path, seconds: float
+) -> dict[str, float]:
+    """Share of a core at 10 and 30 images a second, the latency at 30, in ms, and the memory."""
     driver, figures = Shuttle(bag), {}
     try:
-        with running(parameters) as processes:
+        with running(parameters, cwd=package) as processes:
             if not until(lambda: driver.drive(10.0, 3.0) or driver.state.startswith('LOCALISED')):
                 raise RuntimeError('the nodes do not find the robot')
             for rate_hz in (10, 30):
@@ -183,6 +189,7 @@ def bench_nodes(path: Path, bag: Path, seconds: float = 8.0) -> dict[str, float]
                 driver.drive(rate_hz, seconds)
                 figures[f'cpu_{rate_hz}_hz'] = (cpu_s(processes) - before) / (seconds + IDLE_S)
             median, late = np.percentile(driver.latencies_s, [50, 99]) * 1e3
+            figures['all_mib'] = sum(map(rss_mib, processes))
             return {**figures, 'latency_p50_ms': float(median), 'latency_p99_ms': float(late)}
     finally:
         driver.close()
@@ -267,25 +274,34 @@ def bench_cameras(path: Path, seconds: float = 8.0) -> dict[str, float]:
     return {'cameras_over_mirror': together / alone, 'cameras_latency_p99_ms': latency_ms}
 
 
-def bench_start(path: Path) -> dict[str, float]:
-    """CPU time from exec to active, in s, and the resident memory then, in MiB: the most of all."""
-    figures = []
-    for node, given in parameters_of(PlaceModel.load(path), path).items():
-        process = start_node(node, *given, stdout=PIPE, stderr=STDOUT, text=True)
-        try:
+def rss_mib(process: Any) -> float:
+    """Return the resident memory of a process, in MiB."""
+    return float(psutil.Process(process.pid).memory_info().rss / 2**20)
+
+
+def bench_start(package: Path, parameters: dict[str, list[str]]) -> dict[str, float]:
+    """Until all nodes, started at once, are active: time, in s, and of the node with the most of
+    each, CPU time, in s, and memory, in MiB.
+    """
+    begun = time.perf_counter()
+    with running(parameters, cwd=package, stdout=PIPE, stderr=STDOUT, text=True) as processes:
+        for process in processes:
             next(line for line in process.stdout if line.rstrip().endswith(': active'))
-            rss = psutil.Process(process.pid).memory_info().rss
-            figures.append((cpu_s([process]), rss / 2**20))
-        finally:
-            end_process(process)
-    active_s, memory_mib = map(float, np.max(figures, axis=0))
-    return {'active_s': active_s, 'memory_mib': memory_mib}
+        return {
+            'launch_s': time.perf_counter() - begun,
+            'active_s': max(cpu_s([process]) for process in processes),
+            'memory_mib': max(map(rss_mib, processes)),
+        }
 
 
 if __name__ == '__main__':
-    model_path, bag_path = map(Path, sys.argv[1:3])
-    chain = bench_nodes(model_path, bag_path, *map(float, sys.argv[3:4]))
-    several = {}
-    with suppress(ImportError):  # a release before there were several cameras
-        several = bench_cameras(model_path, *map(float, sys.argv[3:4]))
-    print(json.dumps({**chain, **several, **bench_start(model_path)}))
+    package, model_path, bag_path = map(Path, sys.argv[1:4])
+    seconds = float(sys.argv[4]) if sys.argv[4:] else 8.0
+    nodes = parameters_of(model_path)
+    figures = bench_nodes(package, nodes, bag_path, seconds) | bench_start(package, nodes)
+    if package.resolve() == Path(__file__).parents[2]:  # the last release lacks both
+        alone = bench_nodes(package, composed(nodes), bag_path, seconds)
+        figures |= {f'composed_{name}': value for name, value in alone.items()}
+        with suppress(RuntimeError):  # too busy for the images of four cameras
+            figures |= bench_cameras(model_path, seconds)
+    print(json.dumps(figures))

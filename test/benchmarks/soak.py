@@ -128,7 +128,7 @@ class Nodes:
 
     def __init__(self, model: PlaceModel, folder: Path) -> None:
         model.save(folder / 'model.npz')
-        self.parameters = parameters_of(model, folder / 'model.npz')
+        self.parameters = parameters_of(folder / 'model.npz')
         self.running = {name: start_node(name, *p) for name, p in self.parameters.items()}
 
     def restart(self, name: str) -> None:
