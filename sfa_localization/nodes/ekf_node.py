@@ -86,7 +86,6 @@ class EkfNode(LocalizationNode):
         self._last_change = 0, 0.0
         self._published_s = 0.0
         self._reliable: State | None = None
-        self._troubles = ''
 
     def setup(self) -> None:
         self._begin()
@@ -206,7 +205,7 @@ class EkfNode(LocalizationNode):
 
     def _receive_troubles(self, message: String) -> None:
         """Take why the panorama lacks some of several cameras; '' if it does not."""
-        self._troubles = short_line(message.data) if message.data else ''
+        self.filter.lacking = short_line(message.data) if message.data else ''
 
     def _set_pose(self, message: geometry.PoseWithCovarianceStamped) -> None:
         if message.header.stamp.sec == 0 and message.header.stamp.nanosec == 0:
@@ -339,7 +338,8 @@ class EkfNode(LocalizationNode):
         if self.filter.odometry_in_turn and self.count_publishers(name) > 1:
             reasons.append(f'two publishers on {name}: stop one, or take another topic by odom:=')
             self.get_logger().warning(reasons[-1], throttle_duration_sec=_LOG_S)
-        reasons += [reason for reason in (self._troubles, self.twin) if reason]
+        if self.twin:
+            reasons.append(self.twin)
         if self._paused:
             reasons.append('paused: images are not fused')
         lost = []
