@@ -50,7 +50,8 @@ def errors(run, headings):
 @pytest.mark.parametrize(
     ('topic', 'name'),
     [('/front/image_raw', 'front'), ('/robot/left/color/image_raw/compressed', 'robot/left/color'),
-     ('/front/image_raw/ffmpeg', 'front'), ('/image_raw', 'image_raw')],
+     ('/front/image_raw/ffmpeg', 'front'), ('/image_raw', 'image_raw'),
+     ('/front/raw', 'front'), ('/front/compressed', 'front')],
 )  # fmt: skip
 def test_cameras_are_named_by_their_topics(topic, name):
     assert camera_name(topic) == name

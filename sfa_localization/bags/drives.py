@@ -236,7 +236,7 @@ class _OneCamera:
         self._kept: tuple[int, ...] = ()
         self._size = 0, 0
 
-    def streams(self, bag: Bag, convert: Callable[[Any], Image]) -> dict[str, Stream]:
+    def streams(self, bag: Bag, convert: Callable[[Any], Any]) -> dict[str, Stream]:
         """The stream of panoramas, which `convert` makes of images."""
         return {'images': bag.stream(self._topic, convert)}
 
@@ -282,7 +282,7 @@ class _SeveralCameras:
         self._topics = topics
         self.total = max(bag.topics[topic].count for topic in topics.values())
 
-    def streams(self, bag: Bag, convert: Callable[[Any], Image]) -> dict[str, Stream]:
+    def streams(self, bag: Bag, convert: Callable[[Any], Any]) -> dict[str, Stream]:
         """The stream of panoramas, and those of the cameras, by their uses."""
         joined = SurroundStream(bag, self._topics, self._surround, convert)
         cameras = {f'images of {name}': stream for name, stream in joined.cameras.items()}
