@@ -174,6 +174,34 @@ def test_exposures_are_balanced_where_views_overlap():
     assert_allclose(ratio, mean, rtol=0.04)
 
 
+def test_a_sky_that_some_cameras_cut_off_is_the_same_in_all_headings():
+    """A sky of 230 is 255 for a camera exposed 1.3 times as long, and 161 for one of 0.7."""
+    gains = {'front': 1.0, 'left': 0.7, 'rear': 1.0, 'right': 1.3}
+    scale = np.exp(np.mean(np.log([*gains.values()])))
+
+    def scene(rays):
+        return np.where(rays[:, 2:] > 0.2, 230.0, smooth(rays) / 2)
+
+    surround = Surround(rig(), PANORAMA)
+    for number in range(3):
+        images = {c.name: picture(c, scene, gain=gains[c.name]) for c in rig()}
+        made = feed(surround, number, images)
+    panorama = made[-1][1].astype(float)
+    assert_allclose(panorama[:15], 255 / 1.3 * scale, atol=4)
+    ground = panorama[45:] / direct(lambda rays: smooth(rays) / 2)[45:]
+    assert_allclose(np.median(ground, axis=(0, 1)), scale, rtol=0.03)
+
+
+def test_one_camera_exposed_far_more_than_others_does_not_darken_them():
+    gains = {'front': 0.4, 'left': 0.4, 'rear': 0.4, 'right': 1.2}
+    surround = Surround(rig(), PANORAMA)
+    for number in range(3):
+        images = {c.name: picture(c, gain=gains[c.name]) for c in rig()}
+        made = feed(surround, number, images)
+    ahead = made[-1][1][:, 295:305].astype(float)
+    assert ahead.max() > 115  # the white of the right camera is 112
+
+
 def test_a_turn_between_stamps_is_corrected():
     """At 0.6 rad/s, 40 ms are 2.3 columns."""
     cameras = rig()
