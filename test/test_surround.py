@@ -16,7 +16,7 @@ from sfa_localization.camera.joining import LATE, NO_IMAGE, StampJoiner
 from sfa_localization.camera.panorama import panorama_rays
 from sfa_localization.camera.sectors import MountedCamera, SurroundView, visible_elevations
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.camera.surround import Surround, sentence
+from sfa_localization.camera.surround import Surround, TurnRates, sentence
 from sfa_localization.camera.watch import FROZEN_IMAGES
 from sfa_localization.camera.yaws import turned
 from sfa_localization.data.errors import CameraError
@@ -219,6 +219,24 @@ def test_a_turn_between_stamps_is_corrected():
         heading = 0.6 * (stamp_ns - 10 * STEP) * 1e-9
         errors.append(np.abs(image - direct(heading=heading))[:, :, :2].mean())
     assert errors[1] < 0.4 < 1.0 < errors[0]
+
+
+def test_turns_are_known_where_a_bag_holds_all_odometry_before_the_images():
+    rates = TurnRates()
+    for number in range(10_000):
+        rates.add(10 * STEP + number * 40 * MS, 0.1 + 1e-4 * number)
+    for number in (0, 2000, 9999):
+        at = 10 * STEP + number * 40 * MS
+        assert rates.turn(at - MS, at + MS) == pytest.approx((0.1 + 1e-4 * number) * 2e-3, abs=1e-7)
+    middle = 10 * STEP + 500 * 40 * MS + 20 * MS
+    assert rates.turn(middle + MS, middle - MS) == pytest.approx(-0.15005 * 2e-3)
+    assert rates.turn(9 * STEP, 9 * STEP + 50 * MS) == pytest.approx(
+        0.005
+    )  # within 200 ms of the first
+    assert rates.turn(7 * STEP, 7 * STEP + 50 * MS) == TurnRates().turn(0, MS) == 0.0
+    rates.add(10 * STEP, 1.0)  # the clock was set back
+    assert rates.turn(10 * STEP, 10 * STEP + 10 * MS) == pytest.approx(0.01)
+    assert rates.turn(20 * STEP, 20 * STEP + 10 * MS) == 0.0
 
 
 @pytest.mark.parametrize(
