@@ -220,7 +220,7 @@ def place_of(cameras: Sequence[MountedCamera]) -> complex:
 
 def sentence(cameras: Sequence[MountedCamera]) -> str:
     """Which cameras make one panorama, and where they look."""
-    looks = [f'{camera.name} {np.degrees(camera.yaw):.0f}' for camera in cameras]
+    looks = [f'{camera.name} {round(float(np.degrees(camera.yaw)))}' for camera in cameras]
     return f'{len(cameras)} cameras are one panorama, looking to {", ".join(looks)} degrees of yaw'
 
 
