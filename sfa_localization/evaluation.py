@@ -205,7 +205,10 @@ def _judged(
 def _steps(run: Run, images: Sequence[Observation], fused: PoseFilter) -> Iterator[Step]:
     """Feed a filter with a drive and the observations of its images."""
     fed = replay(fused, run.odometry, run.panoramas.stamps_ns, images)
+    lacking = iter(run.lacking)
     for stamp_ns, image, update in fed:
+        if image is not None:
+            fused.lacking = next(lacking, '')
         at_ns = update.stamp_ns if update else stamp_ns
         yield Step(stamp_ns, image, fused.status, fused.at(at_ns))
 

@@ -191,10 +191,10 @@ def test_panoramas_of_less_than_a_turn_are_named_where_a_gyroscope_shows_it(samp
     turns = np.unwrap(list(headings(sample.panoramas))) * factor
     images = sample.panoramas.stamps_ns, turns
     check = check_motion(sample.odometry, images, sample.yaw_rate)
-    told = [text for text in check.notes if 'degrees would' in text]
+    told = [text for text in check.notes if 'show all around once' in text]
     assert len(told) == (shown is not None)
     for text in told:
-        degrees = float(text.split('panoramas of ')[1].split()[0])
+        degrees = float(text.split(', not ')[1].split()[0])
         assert degrees == pytest.approx(shown, abs=15)
 
 

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images that end in a drive, or come in another order than their stamps, are named."""
 
+from dataclasses import replace
+
 import pytest
 from filter_drives import FilterDrive
 from picture_readers import PictureReader, panorama
@@ -49,6 +51,20 @@ def test_a_stream_of_images_that_ends_in_a_drive_is_named(tmp_path):
                for line in lines)  # fmt: skip
     assert str(result.steps[-1].status).startswith('DEGRADED: ')
     assert 'no usable image for 12 s' in str(result.steps[-1].status)
+
+
+def test_a_drive_without_one_of_several_cameras_is_degraded_as_live(tmp_path, monkeypatch):
+    read_drive = evaluation.read_drive
+    rear = 'camera rear: it sends no images'
+    lacking = ('',) * 30 + (rear,) * 20 + ('',) * 10
+    monkeypatch.setattr(
+        evaluation, 'read_drive', lambda *a, **k: replace(read_drive(*a, **k), lacking=lacking)
+    )
+    result, _ = evaluated(tmp_path / 'rear', range(60))
+    statuses = [str(step.status) for step in result.steps if step.image is not None]
+    assert [rear in status for status in statuses] == [bool(text) for text in lacking]
+    assert all(status.startswith('DEGRADED: ') for status in statuses[30:50])
+    assert set(statuses[20:30] + statuses[50:]) == {'LOCALISED'}
 
 
 def test_a_gap_of_images_is_named_with_its_seconds_and_a_short_one_is_not(tmp_path):

@@ -16,7 +16,7 @@ from sfa_localization.camera.joining import LATE, NO_IMAGE, StampJoiner
 from sfa_localization.camera.panorama import panorama_rays
 from sfa_localization.camera.sectors import MountedCamera, SurroundView, visible_elevations
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.camera.surround import Surround, sentence
+from sfa_localization.camera.surround import Surround, TurnRates, sentence
 from sfa_localization.camera.watch import FROZEN_IMAGES
 from sfa_localization.camera.yaws import turned
 from sfa_localization.data.errors import CameraError
@@ -174,6 +174,34 @@ def test_exposures_are_balanced_where_views_overlap():
     assert_allclose(ratio, mean, rtol=0.04)
 
 
+def test_a_sky_that_some_cameras_cut_off_is_the_same_in_all_headings():
+    """A sky of 230 is 255 for a camera exposed 1.3 times as long, and 161 for one of 0.7."""
+    gains = {'front': 1.0, 'left': 0.7, 'rear': 1.0, 'right': 1.3}
+    scale = np.exp(np.mean(np.log([*gains.values()])))
+
+    def scene(rays):
+        return np.where(rays[:, 2:] > 0.2, 230.0, smooth(rays) / 2)
+
+    surround = Surround(rig(), PANORAMA)
+    for number in range(3):
+        images = {c.name: picture(c, scene, gain=gains[c.name]) for c in rig()}
+        made = feed(surround, number, images)
+    panorama = made[-1][1].astype(float)
+    assert_allclose(panorama[:15], 255 / 1.3 * scale, atol=4)
+    ground = panorama[45:] / direct(lambda rays: smooth(rays) / 2)[45:]
+    assert_allclose(np.median(ground, axis=(0, 1)), scale, rtol=0.03)
+
+
+def test_one_camera_exposed_far_more_than_others_does_not_darken_them():
+    gains = {'front': 0.4, 'left': 0.4, 'rear': 0.4, 'right': 1.2}
+    surround = Surround(rig(), PANORAMA)
+    for number in range(3):
+        images = {c.name: picture(c, gain=gains[c.name]) for c in rig()}
+        made = feed(surround, number, images)
+    ahead = made[-1][1][:, 295:305].astype(float)
+    assert ahead.max() > 115  # the white of the right camera is 112
+
+
 def test_a_turn_between_stamps_is_corrected():
     """At 0.6 rad/s, 40 ms are 2.3 columns."""
     cameras = rig()
@@ -191,6 +219,24 @@ def test_a_turn_between_stamps_is_corrected():
         heading = 0.6 * (stamp_ns - 10 * STEP) * 1e-9
         errors.append(np.abs(image - direct(heading=heading))[:, :, :2].mean())
     assert errors[1] < 0.4 < 1.0 < errors[0]
+
+
+def test_turns_are_known_where_a_bag_holds_all_odometry_before_the_images():
+    rates = TurnRates()
+    for number in range(10_000):
+        rates.add(10 * STEP + number * 40 * MS, 0.1 + 1e-4 * number)
+    for number in (0, 2000, 9999):
+        at = 10 * STEP + number * 40 * MS
+        assert rates.turn(at - MS, at + MS) == pytest.approx((0.1 + 1e-4 * number) * 2e-3, abs=1e-7)
+    middle = 10 * STEP + 500 * 40 * MS + 20 * MS
+    assert rates.turn(middle + MS, middle - MS) == pytest.approx(-0.15005 * 2e-3)
+    assert rates.turn(9 * STEP, 9 * STEP + 50 * MS) == pytest.approx(
+        0.005
+    )  # within 200 ms of the first
+    assert rates.turn(7 * STEP, 7 * STEP + 50 * MS) == TurnRates().turn(0, MS) == 0.0
+    rates.add(10 * STEP, 1.0)  # the clock was set back
+    assert rates.turn(10 * STEP, 10 * STEP + 10 * MS) == pytest.approx(0.01)
+    assert rates.turn(20 * STEP, 20 * STEP + 10 * MS) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,8 @@ def errors(run, headings):
 @pytest.mark.parametrize(
     ('topic', 'name'),
     [('/front/image_raw', 'front'), ('/robot/left/color/image_raw/compressed', 'robot/left/color'),
-     ('/front/image_raw/ffmpeg', 'front'), ('/image_raw', 'image_raw')],
+     ('/front/image_raw/ffmpeg', 'front'), ('/image_raw', 'image_raw'),
+     ('/front/raw', 'front'), ('/front/compressed', 'front')],
 )  # fmt: skip
 def test_cameras_are_named_by_their_topics(topic, name):
     assert camera_name(topic) == name
@@ -96,6 +97,14 @@ def test_a_lost_image_hides_a_sector_of_one_panorama(tmp_path):
     wrong = np.array(errors(run, TURNING))
     assert wrong[3] > 3 > 1 > np.delete(wrong, 3).max()
     assert run.seen is None and run.counts['images of rear'].used == 7
+
+
+def test_a_drive_says_of_which_images_a_camera_was_missing_for_seconds(tmp_path):
+    """The rear camera ends at 1.5 s, and its last image waits for a next one in vain."""
+    skipped = {('rear', number) for number in range(4, 16)}
+    bag = write_bag(tmp_path / 'bag', rig(), 0.05 * np.arange(16), period_s=0.5, skipped=skipped)
+    lacking = read(bag, tmp_path).lacking
+    assert lacking[:15] == ('',) * 10 + ('camera rear: it sends no images',) * 5
 
 
 def test_a_camera_that_a_model_has_and_a_bag_lacks_is_hidden(four, tmp_path):

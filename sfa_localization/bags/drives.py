@@ -194,7 +194,8 @@ def read_drive(
     truth = to_trajectory(streams['ground_truth'].values) if want_truth else None
     seen = images.seen
     motion = (odometry, yaw_rate, truth)
-    return Run(bag.path.name, panoramas, *motion, points, counts, camera, origin, seen)
+    lacking = tuple(stored.lacking)
+    return Run(bag.path.name, panoramas, *motion, points, counts, camera, origin, seen, lacking)
 
 
 def _measured(
@@ -235,9 +236,11 @@ class _OneCamera:
         self._kept: tuple[int, ...] = ()
         self._size = 0, 0
 
-    def streams(self, bag: Bag, convert: Callable[[Any], Image]) -> dict[str, Stream]:
+    def streams(self, bag: Bag, convert: Callable[[Any], Any]) -> dict[str, Stream]:
         """The stream of panoramas, which `convert` makes of images."""
         return {'images': bag.stream(self._topic, convert)}
+
+    lacking = ''
 
     def follow(self, odometry: Stream) -> None:
         """Take no part in the odometry."""
@@ -279,7 +282,7 @@ class _SeveralCameras:
         self._topics = topics
         self.total = max(bag.topics[topic].count for topic in topics.values())
 
-    def streams(self, bag: Bag, convert: Callable[[Any], Image]) -> dict[str, Stream]:
+    def streams(self, bag: Bag, convert: Callable[[Any], Any]) -> dict[str, Stream]:
         """The stream of panoramas, and those of the cameras, by their uses."""
         joined = SurroundStream(bag, self._topics, self._surround, convert)
         cameras = {f'images of {name}': stream for name, stream in joined.cameras.items()}
@@ -312,6 +315,11 @@ class _SeveralCameras:
         """The place of the panoramas, ahead + i left, m."""
         return self._surround.place
 
+    @property
+    def lacking(self) -> str:
+        """Which cameras the last panorama has lacked for too long, as on panorama/troubles."""
+        return '; '.join(self._surround.problems)
+
     def panorama(self, images: Joined) -> Image:
         """The panorama of the images of one time. Raises CameraError."""
         return self._surround.compose(images)
@@ -335,20 +343,24 @@ class _PanoramaFile:
         self.images = images
         self._watch = FrozenWatch() if distinct else None
         self.repeats = 0
+        self.lacking: list[str] = []
         self._shape: tuple[int, ...] = ()
 
-    def panorama(self, images: Any) -> Image:
-        """The panorama of an image, or of the images of one time. Raises LocalizationError."""
+    def panorama(self, images: Any) -> tuple[Image, str]:
+        """The panorama of an image, or of the images of one time, and which cameras it has lacked
+        for too long. Raises LocalizationError.
+        """
         panorama = self.images.panorama(images)
         if self._watch is not None and not self._watch.add(panorama):
             self.repeats += 1
             raise MessageError('image repeats the one before')
         self._shape = panorama.shape
-        return panorama
+        return panorama, self.images.lacking
 
-    def add(self, image: Image) -> None:
+    def add(self, image: Image, lacking: str) -> None:
         """Append a panorama."""
         self._file.write(np.ascontiguousarray(image).data)
+        self.lacking.append(lacking)
 
     def finish(self, stamps_ns: Stamps, keep: NDArray[np.bool_]) -> PanoramaArray:
         """The panoramas marked in `keep` (N,), moved to the beginning of the file."""
@@ -357,6 +369,7 @@ class _PanoramaFile:
         kept = np.flatnonzero(keep)
         for target, source in enumerate(kept):
             images[target] = images[source]
+        self.lacking = [self.lacking[number] for number in kept]
         return PanoramaArray(stamps_ns[kept], images[: len(kept)], self._file)
 
 
@@ -391,8 +404,8 @@ def _collect(bag: Bag, streams: dict[str, Stream], stored: _PanoramaFile, progre
     total = stored.images.total
     with progress_bar(f'read {bag.path.name}', total, visible=progress) as bar:
 
-        def keep(image: Image) -> None:
-            stored.add(image)
+        def keep(panorama: tuple[Image, str]) -> None:
+            stored.add(*panorama)
             bar.update(images.received - bar.n)
 
         images.keep = keep

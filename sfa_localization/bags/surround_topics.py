@@ -25,10 +25,9 @@ from sfa_localization.camera.joining import Joined
 from sfa_localization.camera.sectors import MountedCamera
 from sfa_localization.camera.surround import MOST_CAMERAS, Surround
 from sfa_localization.data.errors import BagError, CameraError, MessageError
-from sfa_localization.data.transforms import TOPIC
+from sfa_localization.data.image_topics import info_topic, without_transport
+from sfa_localization.data.transforms import BASE, TOPIC
 
-BASE = 'base_link'
-"""The frame of the robot where the odometry does not name it."""
 BETWEEN = ','
 """Between the names of several topics in an option or parameter."""
 PATIENCE = 10
@@ -36,23 +35,13 @@ PATIENCE = 10
 _COUNTED = 10  # messages of each topic that show its rate
 _SAME_RATE = 1.5
 _SAME_DIRECTION_DEG = 20.0  # between the optical axes of a stereo pair, or of color and depth
-_TRANSPORTS = ('/compressed', '/ffmpeg', '/theora', '/foxglove')
 
 
 def camera_name(topic: str) -> str:
     """The name of a camera by its topic: 'front' for /front/image_raw/compressed."""
-    plain = _without_transport(topic).strip('/')
+    plain = without_transport(topic).strip('/')
     space, _, _ = plain.rpartition('/')
     return space or plain
-
-
-def _without_transport(topic: str) -> str:
-    return next((topic.removesuffix(t) for t in _TRANSPORTS if topic.endswith(t)), topic)
-
-
-def _info_topic(topic: str) -> str:
-    """The topic of the calibration beside images, as image_transport names it."""
-    return f'{_without_transport(topic).rpartition("/")[0]}/camera_info'
 
 
 def topics_of(bag: Bag, named: str) -> dict[str, str]:
@@ -128,7 +117,7 @@ class _Survey:
         self._base = odometry
         self._infos = dict[str, Any]()
         self._stamps: dict[str, list[int]] = {topic: [] for topic in topics}
-        infos = {_info_topic(topic) for topic in topics} & set(bag.topics)
+        infos = {info_topic(topic) for topic in topics} & set(bag.topics)
         wanted = {TOPIC, odometry, *topics, *infos} & set(bag.topics)
         wanted = {name for name in wanted if decoding.can_decode(bag.topics[name])}
         transforms = bag.topics[TOPIC].count if TOPIC in wanted else 0
@@ -155,7 +144,7 @@ class _Survey:
         texts = []
         if len(self._topics) > MOST_CAMERAS:
             texts.append(f'more than {MOST_CAMERAS} cameras')
-        missing = [info for t in self._topics if (info := _info_topic(t)) not in self._infos]
+        missing = [info for t in self._topics if (info := info_topic(t)) not in self._infos]
         if missing:
             texts.append(f'no {" or ".join(missing)} tells the lens: record camera_info')
         loose = [topic for topic in self._topics if self._pose(topic) is None]
@@ -180,9 +169,9 @@ class _Survey:
     def camera(self, name: str, topic: str) -> MountedCamera:
         """The camera of a topic. Raises CameraError for a calibration that cannot be used."""
         try:
-            lens = calibration_of_info(self._infos[_info_topic(topic)])
+            lens = calibration_of_info(self._infos[info_topic(topic)])
         except CameraError as error:
-            raise CameraError(f'{_info_topic(topic)}: {error}') from None
+            raise CameraError(f'{info_topic(topic)}: {error}') from None
         return MountedCamera.at(name, lens, self._pose(topic))
 
 

@@ -33,6 +33,7 @@ from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import Array, Mask
 from sfa_localization.data.messages import TWIST, full_covariance
 from sfa_localization.data.run import Image, Stamps
+from sfa_localization.data.transforms import BASE
 
 STORAGES = ('mcap', 'sqlite3')
 _NEVER = QosTime(2147483647, 4294967295)  # as ROS writes that a time is not limited
@@ -128,7 +129,7 @@ class BagWriter:
     ) -> None:
         """Write odometry: `pose` x m, y m, yaw rad; `twist` v m/s, omega rad/s; their variances."""
         message = self._stamped('nav_msgs/msg/Odometry', stamp_ns, 'odom')
-        message.child_frame_id = 'base_link'
+        message.child_frame_id = BASE
         _place(message.pose.pose, pose)
         message.twist.twist.linear.x, message.twist.twist.angular.z = map(float, twist)
         message.twist.covariance[[0, 35]] = twist_variance
@@ -142,7 +143,7 @@ class BagWriter:
         covariance: Array,
         twist: Array | None = None,
         twist_covariance: Array | None = None,
-        frames: tuple[str, str] = ('map', 'base_link'),
+        frames: tuple[str, str] = ('map', BASE),
     ) -> None:
         """Write a pose (3,) with covariance (3, 3) as PoseWithCovarianceStamped in frames[0], or
         with a twist (2,) of frames[1] and its covariance (2, 2) as Odometry. A NaN yaw becomes 0.
@@ -209,7 +210,7 @@ class BagWriter:
 
     def imu(self, topic: str, stamp_ns: int, omega: float, variance: float) -> None:
         """Write a gyroscope's yaw rate (rad/s); orientation and acceleration are marked unknown."""
-        message = self._stamped('sensor_msgs/msg/Imu', stamp_ns, 'base_link')
+        message = self._stamped('sensor_msgs/msg/Imu', stamp_ns, BASE)
         message.orientation.w = 1.0
         message.angular_velocity.z = float(omega)
         message.angular_velocity_covariance[8] = variance

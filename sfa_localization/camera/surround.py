@@ -6,6 +6,8 @@ panoramas out. The nodes and the reading of bags both use it.
 
 from __future__ import annotations
 
+from array import array
+from bisect import bisect
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -26,7 +28,8 @@ FEWEST_CAMERAS = 2
 MOST_CAMERAS = 8
 BRIDGED_S = 3.0
 """Seconds for which the panorama may lack a camera, before that is a reason to doubt the pose."""
-_RATES = 200  # of turns that are kept: those of a second or more
+_POSES = 200  # that are kept: those of a second or more
+_RATES = 1_000_000  # of turns that are kept, 16 bytes each: those of 5 hours at 50 Hz
 _SAMPLED = 4  # every fourth pixel along each axis tells whether a camera is dark or frozen
 _SAME_POSE_NS = 100_000_000  # between the last pose and images whose pose it tells
 _NEAR_NS = 200_000_000  # an older rate of turn says nothing about an image
@@ -64,7 +67,7 @@ class Surround:
         self._exposures = Exposures(names)
         self._turns = TurnRates()
         self._yaws = YawWatch(cameras, panorama)
-        self._poses: deque[tuple[int, Array]] = deque(maxlen=_RATES)
+        self._poses: deque[tuple[int, Array]] = deque(maxlen=_POSES)
         self._shown: View | None = None
         self._stamp_ns = 0
         self._uses: Counter[frozenset[str]] = Counter()
@@ -217,33 +220,45 @@ def place_of(cameras: Sequence[MountedCamera]) -> complex:
 
 def sentence(cameras: Sequence[MountedCamera]) -> str:
     """Which cameras make one panorama, and where they look."""
-    looks = [f'{camera.name} {np.degrees(camera.yaw):.0f}' for camera in cameras]
+    looks = [f'{camera.name} {round(float(np.degrees(camera.yaw)))}' for camera in cameras]
     return f'{len(cameras)} cameras are one panorama, looking to {", ".join(looks)} degrees of yaw'
 
 
 class TurnRates:
-    """The rates of turn of the robot lately, rad/s."""
+    """The rates of turn of the robot, rad/s, of some hours: a converted bag may hold all odometry
+    before all images.
+    """
 
     def __init__(self) -> None:
-        self._rates: deque[tuple[int, float]] = deque(maxlen=_RATES)
+        self._stamps_ns = array('q')
+        self._rates = array('d')
 
     def add(self, stamp_ns: int, omega: float) -> None:
         """Take the rate at a stamp; a stamp that steps back begins anew."""
-        if self._rates and stamp_ns <= self._rates[-1][0]:
-            self._rates.clear()
-        self._rates.append((stamp_ns, omega))
+        if self._stamps_ns and stamp_ns <= self._stamps_ns[-1]:
+            self._forget(len(self._rates))
+        if len(self._rates) >= _RATES:
+            self._forget(_RATES // 2)
+        self._stamps_ns.append(stamp_ns)
+        self._rates.append(omega)
+
+    def _forget(self, count: int) -> None:
+        del self._stamps_ns[:count]
+        del self._rates[:count]
 
     def turn(self, start_ns: int, end_ns: int) -> float:
         """The turn from one stamp to another, rad, less than half a period apart; 0 where no rate
         is known.
         """
         middle_ns = (start_ns + end_ns) / 2
-        if end_ns == start_ns or not self._rates:
+        after = bisect(self._stamps_ns, middle_ns)
+        stamps_ns = self._stamps_ns[max(after - 1, 0) : after + 1]
+        if end_ns == start_ns or not stamps_ns:
             return 0.0
-        stamps, rates = np.array(self._rates).T
-        if np.abs(stamps - middle_ns).min() > _NEAR_NS:
+        if min(abs(at_ns - middle_ns) for at_ns in stamps_ns) > _NEAR_NS:
             return 0.0
-        return float(np.interp(middle_ns, stamps, rates)) * (end_ns - start_ns) * 1e-9
+        rates = self._rates[max(after - 1, 0) : after + 1]
+        return float(np.interp(middle_ns, stamps_ns, rates)) * (end_ns - start_ns) * 1e-9
 
 
 class Exposures:

@@ -212,7 +212,8 @@ class Run:
     `counts` holds the used and skipped messages per stream ('images', 'odometry', ...); `camera`
     is the lever arm of the camera, ahead + i left of base_link, m, if the bag contains it. Places
     of a satellite receiver count from the `origin`. Where the robot hides its view, panoramas show
-    what is `seen` (H, W).
+    what is `seen` (H, W). `lacking` (N) says of each panorama which of several cameras it has
+    lacked for too long, and why; '' if none.
     """
 
     name: str
@@ -225,6 +226,7 @@ class Run:
     camera: complex | None = None
     origin: Origin | None = None
     seen: Mask | None = None
+    lacking: tuple[str, ...] = ()
 
 
 def integrate(stamps_ns: Stamps, twists: Array, start: Array | None = None) -> Array:

@@ -13,6 +13,8 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import require_sane
 
 TOPIC = '/tf_static'
+BASE = 'base_link'
+"""The robot's frame where nothing names it (REP 105)."""
 
 
 class TransformTree:

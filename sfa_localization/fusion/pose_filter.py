@@ -75,6 +75,8 @@ class PoseFilter:
         self.scale = self.config.odometry_scale
         self.waited_s = 0.0
         """How long messages have recently waited for this program: they show no clocks."""
+        self.lacking = ''
+        """Why panoramas have lacked some of several cameras for too long; '' if they have not."""
         self._nis = 0.0, 0
         self._camera = CameraClockFinder(_CLOCK_MEMORY)
         self._expected_s = 0.0
@@ -373,4 +375,6 @@ class PoseFilter:
         doubts = of_clocks
         if self.odometry_in_turn:
             doubts.append('odometry leads along two paths in turn: its poses are not used')
+        if self.lacking:
+            doubts.append(self.lacking)
         return status.with_reasons([], doubts)

@@ -192,8 +192,9 @@ def _judge_width(check: MotionCheck) -> None:
     factor = abs(pair.scale)
     if not 1 / WHOLE_BY_GYRO < factor < WHOLE_BY_GYRO:
         check.notes.append(
-            f'{IMAGES} turn {factor:.2f} times as far as the {GYRO}, as panoramas of '
-            f'{360 / factor:.0f} degrees would: let their width show all around once'
+            f'{IMAGES} turn {factor:.2f} times as far as the {GYRO}: let the width of panoramas '
+            f'show all around once, not {360 / factor:.0f} degrees; of several cameras, check the '
+            'focal lengths in camera_info'
         )
 
 

@@ -4,24 +4,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from sfa_localization.data.image_topics import without_transport
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.process import NODES
 
 PATIENCE_S = 3.0
 """Time before another topic is taken: drivers of cameras and wheels may start after this node."""
-_TRANSPORT = re.compile('/(compressed|ffmpeg|foxglove)$')
 DEPTH = '/compressedDepth'
 _OUTPUTS = '/ekf/odometry', '/panorama', '/panorama/compressed'
 """Odometry and images of this package's nodes, which a bag may hold: never an input."""
-
-
-def without_transport(topic: str) -> str:
-    """The name of an image topic without that of its transport, as image_transport names it."""
-    return _TRANSPORT.sub('', topic)
 
 
 def is_ours(node: Any, name: str) -> bool:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from functools import partial
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -87,7 +86,7 @@ class EkfNode(LocalizationNode):
         self._last_change = 0, 0.0
         self._published_s = 0.0
         self._reliable: State | None = None
-        self._troubles = dict[str, str]()
+        self._moved = ''
 
     def setup(self) -> None:
         self._begin()
@@ -108,8 +107,8 @@ class EkfNode(LocalizationNode):
             sensor_qos(20),
         )
         self.subscribe(String, 'sfa/rig', self._receive_rig, latched_qos())
-        for topic in ('panorama/troubles', 'sfa/troubles'):
-            self.subscribe(String, topic, partial(self._receive_troubles, topic), latched_qos())
+        self.subscribe(String, 'panorama/troubles', self._receive_missing, latched_qos())
+        self.subscribe(String, 'sfa/troubles', self._receive_moved, latched_qos())
         for topic in ('initialpose', '~/set_pose'):
             self.subscribe(pose, topic, self._set_pose, QoSProfile(depth=1))
         self.service(Trigger, '~/reset', self._reset)
@@ -206,9 +205,13 @@ class EkfNode(LocalizationNode):
         for line in rig.as_text():
             self.get_logger().info(line)
 
-    def _receive_troubles(self, topic: str, message: String) -> None:
-        """Take which cameras are missing, or were moved; '' if none."""
-        self._troubles[topic] = short_line(message.data) if message.data else ''
+    def _receive_missing(self, message: String) -> None:
+        """Take why the panorama lacks some of several cameras; '' if it does not."""
+        self.filter.lacking = short_line(message.data) if message.data else ''
+
+    def _receive_moved(self, message: String) -> None:
+        """Take where the camera sits otherwise than in training; '' if it does not."""
+        self._moved = short_line(message.data) if message.data else ''
 
     def _set_pose(self, message: geometry.PoseWithCovarianceStamped) -> None:
         if message.header.stamp.sec == 0 and message.header.stamp.nanosec == 0:
@@ -341,7 +344,7 @@ class EkfNode(LocalizationNode):
         if self.filter.odometry_in_turn and self.count_publishers(name) > 1:
             reasons.append(f'two publishers on {name}: stop one, or take another topic by odom:=')
             self.get_logger().warning(reasons[-1], throttle_duration_sec=_LOG_S)
-        reasons += [reason for reason in (*self._troubles.values(), self.twin) if reason]
+        reasons += [reason for reason in (self._moved, self.twin) if reason]
         if self._paused:
             reasons.append('paused: images are not fused')
         lost = []

@@ -10,10 +10,10 @@ from typing import Any
 
 from sfa_localization.camera.video import ImageReader
 from sfa_localization.data.errors import CameraError, ConfigError, LocalizationError
+from sfa_localization.data.image_topics import TRANSPORTS
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.data.run import Image
 from sfa_localization.nodes.lifecycle import LocalizationNode, sensor_qos
-from sfa_localization.nodes.settings import TRANSPORTS
 
 _PACKETS = 30
 """Packets of a video that wait, a second of most: a lost one costs all images until a key frame. Of

@@ -35,12 +35,13 @@ from sfa_localization.camera.settings import (
 from sfa_localization.camera.surround import Surround
 from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import ConfigError, MessageError
+from sfa_localization.data.image_topics import CAMERA_INFO, info_topic
 from sfa_localization.data.messages import read_stamp, read_tilt
 from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes import lifecycle
-from sfa_localization.nodes.discovery import Discovery, without_transport
+from sfa_localization.nodes.discovery import Discovery
 from sfa_localization.nodes.image_input import ImageInput
 from sfa_localization.nodes.lifecycle import ERROR, OK, WARN
 from sfa_localization.nodes.monitor import steady_s
@@ -53,7 +54,6 @@ _DEMAND_PERIOD_S = 0.1  # between checks for subscribers: a new one waits no lon
 _LITTLE_VISIBLE = 0.5  # a smaller visible share of the panorama gives a warning
 _IMU = 'imu/data'
 _ORIENTATIONS = 500  # the number kept: those of a second or more
-_CAMERA_INFO = 'camera_info'
 
 
 class OmnicamNode(lifecycle.LocalizationNode):
@@ -212,15 +212,14 @@ class OmnicamNode(lifecycle.LocalizationNode):
                 take = self._take_calibration
                 qos = lifecycle.sensor_qos(1)
                 topic = self._info_topic
-                self._calibrations = self.subscribe(CameraInfo, _CAMERA_INFO, take, qos, topic)
+                self._calibrations = self.subscribe(CameraInfo, CAMERA_INFO, take, qos, topic)
 
     @property
     def _info_topic(self) -> str:
-        """The topic beside that of the images, as image_transport names it, unless remapped."""
-        if self.is_remapped(_CAMERA_INFO):
-            return _CAMERA_INFO
-        images = without_transport(self.full_name(self._input))
-        return f'{images.rpartition("/")[0]}/{_CAMERA_INFO}'
+        """The topic beside that of the images, unless remapped."""
+        if self.is_remapped(CAMERA_INFO):
+            return CAMERA_INFO
+        return info_topic(self.full_name(self._input))
 
     def _take_calibration(self, message: CameraInfo) -> None:
         """Use the first that describes a lens."""
@@ -231,7 +230,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
             self._lens = lens
             self._unwrapper = unwrapper
             camera = f'{lens.camera_model} camera of {lens.image_width} x {lens.image_height}'
-            self.get_logger().info(f'{self.full_name(_CAMERA_INFO)} describes a {camera} pixels')
+            self.get_logger().info(f'{self.full_name(CAMERA_INFO)} describes a {camera} pixels')
         elif lens != self._lens:
             raise MessageError('another calibration than the first, which stays until a restart')
 

@@ -7,15 +7,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sfa_localization.data.errors import ConfigError
+from sfa_localization.data.image_topics import TRANSPORTS
 from sfa_localization.data.settings import Settings, setting
+from sfa_localization.data.transforms import BASE
 
-TRANSPORTS = {
-    'raw': 'sensor_msgs/msg/Image',
-    'compressed': 'sensor_msgs/msg/CompressedImage',
-    'ffmpeg': 'ffmpeg_image_transport_msgs/msg/FFMPEGPacket',
-    'foxglove': 'foxglove_msgs/msg/CompressedVideo',
-}
-"""Types of messages by the names that image_transport gives to them."""
 _TRANSPORTS = tuple(TRANSPORTS)
 
 
@@ -65,7 +60,7 @@ class SfaNodeConfig(Settings):
     model: str = setting('', 'file of the trained model', live=True)
     map_frame: str = setting('map', 'frame of the poses')
     base_frame: str = setting(
-        'base_link', "the robot's frame, from which /tf_static is compared with the camera's place"
+        BASE, "the robot's frame, from which /tf_static is compared with the camera's place"
     )
     image_transport: str = setting(
         'raw', 'listen to panorama, or to panorama/compressed and so on', choices=_TRANSPORTS
@@ -81,7 +76,7 @@ class EkfNodeConfig(Settings):
 
     map_frame: str = setting('map', 'frame of the estimate')
     odom_frame: str = setting('odom', "the odometry's frame, where its messages have none")
-    base_frame: str = setting('base_link', "the robot's frame, where odometry messages have none")
+    base_frame: str = setting(BASE, "the robot's frame, where odometry messages have none")
     publish_tf: bool = setting(True, 'broadcast map -> odom (needs tf2_msgs)')
     transform_tolerance: float = setting(
         0.1, 'how long map -> odom holds beyond odometry', unit='s', low=0.0, high=10.0, live=True

@@ -23,10 +23,11 @@ from sfa_localization.camera.settings import LensCalibration, SurroundConfig
 from sfa_localization.camera.surround import Surround, require_rig
 from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.image_topics import CAMERA_INFO, info_topic
 from sfa_localization.data.messages import read_odometry, read_stamp
 from sfa_localization.data.run import Image
-from sfa_localization.data.transforms import TOPIC, TransformTree
-from sfa_localization.nodes.discovery import Discovery, without_transport
+from sfa_localization.data.transforms import BASE, TOPIC, TransformTree
+from sfa_localization.nodes.discovery import Discovery
 from sfa_localization.nodes.image_input import ImageInput
 from sfa_localization.nodes.lifecycle import (
     ERROR,
@@ -39,8 +40,6 @@ from sfa_localization.nodes.lifecycle import (
 )
 
 _ODOM = 'odom'
-_BASE = 'base_link'
-"""The robot's frame, where odometry names none."""
 
 
 class Descriptions:
@@ -59,9 +58,8 @@ class Descriptions:
     def start(self) -> None:
         """Subscribe to what is not known."""
         for name in self._topics.keys() - self._lenses.keys():
-            images = without_transport(self._node.full_name(self._topics[name]))
-            info = f'{name}/camera_info'
-            beside = f'{images.rpartition("/")[0]}/camera_info'
+            info = f'{name}/{CAMERA_INFO}'
+            beside = info_topic(self._node.full_name(self._topics[name]))
             topic = info if self._node.is_remapped(info) else beside
             take = partial(self._take_info, name)
             described = self._node.subscribe(CameraInfo, info, take, sensor_qos(1), topic)
@@ -83,7 +81,7 @@ class Descriptions:
         """Look where the frame of a camera's images sits on the robot's frame."""
         if name not in self._poses:
             pose = self._tree.pose(frame, base)
-            pose = self._tree.pose(frame, _BASE) if pose is None else pose
+            pose = self._tree.pose(frame, BASE) if pose is None else pose
             if pose is not None:
                 self._poses[name] = pose
 
@@ -95,7 +93,7 @@ class Descriptions:
         parts = [f'no camera_info of {lenses}: publish it, or set camera_files'] if lenses else []
         if poses:
             parts.append(
-                f'no pose of {poses} on /tf_static from {_BASE}: publish it, or set camera_poses'
+                f'no pose of {poses} on /tf_static from {BASE}: publish it, or set camera_poses'
             )
         return '; '.join(parts)
 
@@ -125,7 +123,7 @@ class SurroundInput:
         self._node = node
         self._make = make
         self._use = use
-        self._base = _BASE
+        self._base = BASE
         self._odometry: Any = None
         self._odometry_topic = ''
         self._listens = False
@@ -195,7 +193,7 @@ class SurroundInput:
         """
         pose, (_, omega, *_) = read_odometry(message)
         stamp_ns = read_stamp(message.header.stamp)
-        self._base = message.child_frame_id or _BASE
+        self._base = message.child_frame_id or BASE
         if self.surround is not None:
             self.surround.add_turn_rate(stamp_ns, omega)
         if self.surround is not None and pose is not None:

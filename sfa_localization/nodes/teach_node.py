@@ -34,14 +34,15 @@ from sfa_localization.bags.recorder import BagRecorder, files_with_messages
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.data.errors import BagError, ConfigError, LocalizationError
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.image_topics import TRANSPORTS, without_transport
 from sfa_localization.mapping.driven_ground import DrivenGround
 from sfa_localization.mapping.settings import GroundConfig
 from sfa_localization.nodes import conversions as convert
-from sfa_localization.nodes.discovery import DEPTH, is_ours, without_transport
+from sfa_localization.nodes.discovery import DEPTH, is_ours
 from sfa_localization.nodes.lifecycle import ERROR, OK, WARN, LocalizationNode, latched_qos
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.process import NODES
-from sfa_localization.nodes.settings import TRANSPORTS, TeachNodeConfig
+from sfa_localization.nodes.settings import TeachNodeConfig
 from sfa_localization.nodes.worker import Worker
 
 STATIC_TF = 'tf2_msgs/msg/TFMessage'

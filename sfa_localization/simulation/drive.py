@@ -25,6 +25,7 @@ from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.progress import progress_over
 from sfa_localization.data.run import Image, Odometry, Stamps, Trajectory, YawRate, integrate
+from sfa_localization.data.transforms import BASE
 from sfa_localization.simulation.cameras import SimulatedCamera, simulated_cameras
 from sfa_localization.simulation.garden import Garden, rounded
 from sfa_localization.simulation.rendering import Light, View, panorama_view, raw_view
@@ -322,7 +323,7 @@ def _of_cameras(
     """Transforms, calibrations and images of cameras; `shown` shows the progress of the first."""
     start_ns = int(drive.truth.stamps_ns[0])
     poses = {camera.frame: camera.mounted for camera in cameras}
-    transforms = partial(bag.static_transforms, start_ns, 'base_link', poses)
+    transforms = partial(bag.static_transforms, start_ns, BASE, poses)
     entries: list[Entries] = [iter([(start_ns, transforms)])]
     for number, camera in enumerate(cameras):
         skewed = replace(drive, image_stamps_ns=drive.image_stamps_ns + camera.skew_ns)
