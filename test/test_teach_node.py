@@ -9,13 +9,17 @@ import subprocess
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import pytest
 from page_tables import ROOT
 
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.recorder import BagRecorder
 from sfa_localization.data.errors import BagError
-from sfa_localization.inspection import inspect
+from sfa_localization.data.run import Trajectory
+from sfa_localization.evaluation import evaluate, moved, score
+from sfa_localization.fusion.status import Level
+from sfa_localization.inspection import inspect, path_length
 from sfa_localization.place_model import PlaceModel
 
 pytest.importorskip('rclpy')
@@ -23,12 +27,13 @@ pytest.importorskip('rclpy')
 import rclpy
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.serialization import deserialize_message
-from ros_bench import start_process, until
+from ros_bench import SEEN, start_process, until
 from sensor_msgs.msg import CompressedImage, Image, Imu
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from sfa_localization.nodes.conversions import read_odometry
 from sfa_localization.nodes.ekf_node import EkfNode
 from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.nodes.omnicam_node import OmnicamNode
@@ -39,6 +44,7 @@ from sfa_localization.nodes.worker import Worker
 pytestmark = pytest.mark.ros
 KINDS = {'/odom': Odometry, '/imu': Imu, '/panorama_raw/compressed': CompressedImage}
 SAMPLE = ROOT / 'bags/sample'
+TEST = ROOT / 'bags/sample_test'
 
 
 def records(path, *topics):
@@ -194,16 +200,23 @@ def test_a_drive_is_taught_and_learned(bench, chain, taught, tmp_path):
     grids = bench.listen(OccupancyGrid, 'teach/map', latched_qos())
     hints = bench.listen(MarkerArray, 'teach/hints', latched_qos())
     messages = records(SAMPLE, '/odom', '/imu', '/panorama/compressed')
-    third = len(messages) // 3
+    images = [n for n, (topic, *_) in enumerate(messages) if topic.startswith('/panorama')]
     drive = driver(bench, taught._recorder.counts.total)
-    drive(messages[:third])
-    assert until(lambda: 'not' in taught._said or 'few' in taught._said), taught._said
-    drive(messages[third:])
-    assert until(lambda: any('enough to train on' in each.data for each in said)), taught._said
-    assert 0 in grids[-1].data and hints[-1].markers[-1].text.startswith('enough')
+    # Two images more are enough, here and to `inspect`, which skips a single one after a pause.
+    drive(messages[: images[299]])
+    assert until(lambda: '299 images with odometry are few' in said[-1].data), said[-1].data
+    recorded = tmp_path / 'garden_drive1'
+    (few,) = inspect(recorded).lacks
+    assert few in said[-1].data and not any('enough to' in each.data for each in said)
+    drive(messages[images[299] : images[301]])
+    assert until(lambda: 'enough to train on' in said[-1].data), said[-1].data
+    assert inspect(recorded).lacks == []
+    assert until(lambda: hints[-1].markers[-1].text.startswith('enough'))
+    assert until(lambda: 0 in grids[-1].data)
+    drive(messages[images[301] :])
     assert call(bench, 'finish').success
     assert until(lambda: 'is written. The map' in said[-1].data, 300.0), said[-1].data
-    report = inspect(tmp_path / 'garden_drive1')
+    report = inspect(recorded)
     assert report.lacks == [] and report.problems == []
     assert {name: topic.count for name, topic in ((t.name, t) for t in report.topics)} == {
         '/odom': 3176, '/imu': 3176, '/panorama_raw/compressed': 427,
@@ -213,26 +226,48 @@ def test_a_drive_is_taught_and_learned(bench, chain, taught, tmp_path):
     answer = call(bench, 'finish')
     assert not answer.success and '~/extend' in answer.message
     assert until(lambda: all(node.active for node in chain))
-    located = bench.listen(String, 'ekf/state', latched_qos())
-    inputs = [chain[2].monitors['odom'], chain[0].monitors['image_raw/compressed']]
-    localize(bench, inputs, located)
+    assert_localised_as_offline(bench, chain, model)
     assert call(bench, 'extend').success and taught._recorder.folder.name == 'garden_drive2'
     assert call(bench, 'cancel').success
 
 
-def localize(bench, inputs, located):
-    """The test drive, until the robot is localised: within two meters of driving and a turn."""
+def assert_localised_as_offline(bench, chain, model):
+    """On the test drive: by the first image after two meters, with the error of `evaluate`."""
+    located = bench.listen(String, 'ekf/state', latched_qos())
+    fused = bench.listen(Odometry, 'ekf/odometry')
+    driven, localised = [], []
+    for message in passed_on(bench, chain):
+        if isinstance(message, Odometry):
+            driven.append(read_odometry(message)[2][:2])
+        else:
+            # Between two callbacks, the image is fused.
+            bench.do(lambda: localised.append(chain[2].status().level is Level.LOCALISED))
+            if localised.count(True) == 1 and localised[-1]:
+                assert path_length(np.array(driven)) < 2.25  # images are 0.21 m apart
+    assert any(localised) and until(lambda: located[-1].data == 'LOCALISED')
+    offline = evaluate(model, TEST, align_bags=[SAMPLE])
+    assert until(lambda: len(fused) == offline.scores['ekf']['n'])
+    read = [read_odometry(message) for message in fused]
+    live = Trajectory(np.array([r[0] for r in read]), np.array([r[2] for r in read]))
+    error = score(offline.truth, moved(live, offline.transform))
+    assert error['mean'] == pytest.approx(offline.scores['ekf']['mean'], abs=0.003)
+
+
+def passed_on(bench, chain):
+    """Sends the messages of the test drive, and yields each when it came through the chain."""
     sent = {each.topic_name: each for each in bench.node.publishers}
-    messages = records(ROOT / 'bags/sample_test', '/odom', '/panorama/compressed')
-    for topic, _, data, _ in messages:
+    omnicam, sfa, ekf = (node.monitors for node in chain)
+    through = {
+        '/odom': [ekf['odom']],
+        '/panorama_raw/compressed': [omnicam['image_raw/compressed'], sfa['panorama'], ekf[SEEN]],
+    }
+    for topic, _, data, _ in records(TEST, '/odom', '/panorama/compressed'):
         topic = '/panorama_raw/compressed' if topic.startswith('/panorama') else topic
-        monitor = inputs[topic != '/odom']
-        due = monitor.received + 1
-        sent[topic].publish(deserialize_message(data, KINDS[topic]))
-        assert until(lambda: monitor.received >= due)  # noqa: B023
-        if located and located[-1].data == 'LOCALISED':
-            return
-    assert until(lambda: located[-1].data == 'LOCALISED', 5.0), located[-1].data
+        message = deserialize_message(data, KINDS[topic])
+        due = [monitor.received + 1 for monitor in through[topic]]
+        sent[topic].publish(message)
+        assert until(lambda: [each.received for each in through[topic]] == due)  # noqa: B023
+        yield message
 
 
 def record(folder, *topics):
