@@ -67,6 +67,8 @@ def test_a_recorded_bag_holds_the_same_messages_also_after_it_went_on(tmp_path):
     assert len([*folder.glob('*.mcap')]) == 1
     with Bag(folder) as bag:
         assert sum(topic.count for topic in bag.topics.values()) == 300
+        cut = 'drive_0.mcap: was not closed, as where the power was cut: read as far as it goes; '
+        assert bag.problems == [f'{cut}`mcap recover` repairs it']
     second = BagRecorder(folder)
     for message in messages[300:]:
         second.write(*message)
