@@ -162,8 +162,8 @@ class BagReport:
     `camera` the kind of camera that they show, `lens` a sentence about its lens, which the settings
     describe or not (`is_described`). `cameras` is one about several that make a panorama;
     `image_topic` is the first of theirs. `drives` are the poses (M, 3) of images with `odometry` in
-    each unbroken part of it, as corrected; `motion` compares odometry, images and gyroscope; `tilt` is that of
-    the ground.
+    each unbroken part of it, as corrected; `motion` compares odometry, images and gyroscope; `tilt`
+    is that of the ground.
     """
 
     path: str

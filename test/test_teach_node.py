@@ -6,6 +6,7 @@ import errno
 import os
 import signal
 import subprocess
+import time
 from pathlib import Path
 from unittest import mock
 
@@ -25,9 +26,11 @@ from sfa_localization.place_model import PlaceModel
 pytest.importorskip('rclpy')
 
 import rclpy
+from builtin_interfaces.msg import Time
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.serialization import deserialize_message
 from ros_bench import SEEN, start_process, until
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image, Imu
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -284,6 +287,7 @@ def test_only_what_was_not_taught_goes_on(bench, tmp_path):
     output = tmp_path / 'garden.npz'
     record(tmp_path / 'garden_drive1')
     output.touch()
+    (tmp_path / 'garden_teach').mkdir()  # by a node that was killed
     node = bench.run(TeachNode, output=str(output))
     said = bench.listen(String, 'teach/state', latched_qos())
     assert until(
@@ -293,6 +297,7 @@ def test_only_what_was_not_taught_goes_on(bench, tmp_path):
     assert call(bench, 'extend').message.endswith('garden_drive2')
     assert call(bench, 'cancel').success and not any((tmp_path / 'garden_drive2').iterdir())
     bench.end(node)
+    assert not (tmp_path / 'garden_teach').exists()
     os.utime(output, (1.0, 1.0))
     node = bench.run(TeachNode, output=str(output))
     goes_on = f'waiting for images and odometry to go on with {tmp_path}/garden_drive1'
@@ -305,6 +310,34 @@ def test_only_what_was_not_taught_goes_on(bench, tmp_path):
     answer = call(bench, 'finish')
     assert answer.success and call(bench, 'cancel').success
     assert said[-1].data == f'canceled; {tmp_path}/garden_drive1: kept for ~/finish'
+
+
+def test_a_clock_that_was_set_back_begins_a_drive_and_files_of_the_future_keep_their_order(
+    bench, tmp_path
+):
+    """As after a power cut, of a board whose clock does not go on."""
+    record(tmp_path / 'garden_drive1')  # at the sample's time
+    record(tmp_path / 'garden_drive2')
+    output = tmp_path / 'garden.npz'
+    output.touch()
+    for ahead_s, path in enumerate(
+        [tmp_path / 'garden_drive1', output, tmp_path / 'garden_drive2']
+    ):
+        later_s = time.time() + 3600 + ahead_s
+        for file in [*path.glob('*.mcap')] or [path]:
+            os.utime(file, (later_s, later_s))
+    node = bench.run(TeachNode, output=str(output), use_sim_time=True)
+    assert node._untaught() == [tmp_path / 'garden_drive2']
+    assert output.stat().st_mtime < time.time()
+    said = bench.listen(String, 'teach/state', latched_qos())
+    bench.publish_until(
+        '/clock', Clock(clock=Time(sec=1)), lambda: node.get_clock().now().nanoseconds
+    )
+    again = f'the clock was set back: {tmp_path}/garden_drive3 is a drive of its own'
+    bench.publish_until('/odom', Odometry(), lambda: any(again in each.data for each in said))
+    bench.publish_until('/odom', Odometry(), lambda: node._recorder.counts)
+    bench.do(node._end_recording)
+    assert node._untaught() == [tmp_path / 'garden_drive2', tmp_path / 'garden_drive3']
 
 
 def test_a_drive_that_ended_with_the_disk_is_finished(bench, taught):

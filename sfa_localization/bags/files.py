@@ -80,7 +80,7 @@ def describe(error: Exception) -> str:
 
 
 class McapFile:
-    """One .mcap file, chunk by chunk; `start_ns` is the first reception.
+    """One .mcap file, chunk by chunk; `start_ns` and `end_ns` are the first and last reception.
 
     Raises BagError where it holds no message.
     """
@@ -90,6 +90,7 @@ class McapFile:
         self._problems = problems
         self._file = path.open('rb')
         self.start_ns = _LATEST
+        self.end_ns = 0
         self.topics = dict[int, Topic]()
         is_whole = self._read_index()
         if not self.topics:
@@ -123,6 +124,7 @@ class McapFile:
             return False
         if summary is not None and summary.statistics is not None:
             self.start_ns = summary.statistics.message_start_time
+            self.end_ns = summary.statistics.message_end_time
             counts = summary.statistics.channel_message_counts
             self._define(summary.channels, summary.schemas, counts)
         return True
@@ -140,6 +142,7 @@ class McapFile:
             elif isinstance(record, Message):
                 counts[record.channel_id] += 1
                 self.start_ns = min(self.start_ns, record.log_time)
+                self.end_ns = max(self.end_ns, record.log_time)
         self._define(channels, schemas, counts)
 
     def _define(
