@@ -12,7 +12,6 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from page_tables import ROOT
 
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.recorder import BagRecorder
@@ -28,36 +27,28 @@ pytest.importorskip('rclpy')
 import rclpy
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import OccupancyGrid, Odometry
-from rclpy.serialization import deserialize_message
-from ros_bench import SEEN, start_process, until
+from ros_bench import start_process, until
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image, Imu
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from taught_drives import (
+    SAMPLE,
+    TEST,
+    driver,
+    passed_on,
+    records,
+    start_chain,
+    start_teaching,
+)
 from visualization_msgs.msg import MarkerArray
 
 from sfa_localization.nodes.conversions import read_odometry
-from sfa_localization.nodes.ekf_node import EkfNode
 from sfa_localization.nodes.lifecycle import latched_qos
-from sfa_localization.nodes.omnicam_node import OmnicamNode
-from sfa_localization.nodes.sfa_node import SfaNode
 from sfa_localization.nodes.teach_node import TeachNode
 from sfa_localization.nodes.worker import Worker
 
 pytestmark = pytest.mark.ros
-KINDS = {'/odom': Odometry, '/imu': Imu, '/panorama_raw/compressed': CompressedImage}
-SAMPLE = ROOT / 'bags/sample'
-TEST = ROOT / 'bags/sample_test'
-
-
-def records(path, *topics):
-    """Topic, type, bytes and time of the messages of a bag."""
-    with Bag(path) as bag:
-        assert bag.problems == []
-        return [
-            (topic.name, topic.kind, bytes(data), at_ns)
-            for topic, at_ns, data in bag.recording.messages(topics or [*bag.topics])
-        ]
 
 
 def test_a_recorded_bag_holds_the_same_messages_also_after_it_went_on(tmp_path):
@@ -121,13 +112,13 @@ def is_running(pid):
     return stat.exists() and stat.read_text().rpartition(') ')[2][0] != 'Z'
 
 
-def test_a_command_ends_with_a_node_that_is_killed(tmp_path):
+def test_a_command_ends_with_a_node_that_is_killed():
     code = (
-        'import sys, time; from pathlib import Path; from sfa_localization.nodes.worker import '
-        "Worker; worker = Worker(['play', sys.argv[1], '--wait', '1000'], Path(sys.argv[2])); "
+        'import sys, time; from sfa_localization.nodes.worker import '
+        "Worker; worker = Worker(['play', sys.argv[1], '--wait', '1000']); "
         'print(worker._process.pid, flush=True); time.sleep(1000)'
     )
-    node = start_process('-c', code, SAMPLE, tmp_path / 'log', stdout=subprocess.PIPE)
+    node = start_process('-c', code, SAMPLE, stdout=subprocess.PIPE)
     pid = int(node.stdout.readline())
     assert until(lambda: b'sfa_localization' in Path(f'/proc/{pid}/cmdline').read_bytes())
     assert is_running(pid)
@@ -137,11 +128,11 @@ def test_a_command_ends_with_a_node_that_is_killed(tmp_path):
 
 
 def test_a_signal_is_named_in_place_of_the_progress(tmp_path):
-    worker = Worker(['play', SAMPLE, '--wait', '1000'], tmp_path / 'log')
+    worker = Worker(['play', SAMPLE, '--wait', '1000'])
     os.kill(worker._process.pid, signal.SIGKILL)
     assert until(lambda: worker.code is not None)
     assert worker.failure() == 'SIGKILL ended it, as by a system without memory'
-    worker = Worker(['play', tmp_path / 'none'], tmp_path / 'log')
+    worker = Worker(['play', tmp_path / 'none'])
     assert until(lambda: worker.code is not None)
     assert worker.failure() == worker.last_line() and 'no such bag' in worker.failure()
 
@@ -159,45 +150,16 @@ def test_a_disk_that_cannot_keep_the_bag_is_named(tmp_path):
 
 @pytest.fixture
 def taught(bench, tmp_path):
-    output = str(tmp_path / 'garden.npz')
-    return bench.run(TeachNode, output=output, share=1.0, localize=True)
+    return start_teaching(bench, tmp_path / 'garden.npz')
 
 
 @pytest.fixture
 def chain(bench, tmp_path):
-    """The three nodes, which wait for a model."""
-    images = ['--ros-args', '-r', 'image_raw/compressed:=/panorama_raw/compressed']
-    model = str(tmp_path / 'garden.npz')
-    waiting = {'autostart': False}
-    options = {'cli_args': images}
-    return [
-        bench.run(
-            OmnicamNode, options=options, image_transport='compressed', model=model, **waiting
-        ),
-        bench.run(SfaNode, model=model, **waiting),
-        bench.run(EkfNode, **waiting),
-    ]
+    return start_chain(bench, tmp_path / 'garden.npz')
 
 
 def call(bench, name):
     return bench.call(Trigger, f'teach_node/{name}', Trigger.Request())
-
-
-def driver(bench, counted):
-    """Sends recorded messages through DDS, as fast as they are counted."""
-    create = bench.node.create_publisher
-    topics = {topic: create(kind, topic, 1000) for topic, kind in KINDS.items()}
-    assert until(lambda: all(each.get_subscription_count() for each in topics.values()))
-
-    def drive(messages):
-        before = counted()
-        for number, (topic, _, data, _) in enumerate(messages, before + 1):
-            topic = '/panorama_raw/compressed' if topic.startswith('/panorama') else topic
-            topics[topic].publish(deserialize_message(data, KINDS[topic]))
-            assert until(lambda: counted() > number - 40)  # noqa: B023
-        assert until(lambda: counted() == before + len(messages))
-
-    return drive
 
 
 def test_a_drive_is_taught_and_learned(bench, chain, taught, tmp_path):
@@ -256,23 +218,6 @@ def assert_localised_as_offline(bench, chain, model):
     live = Trajectory(np.array([r[0] for r in read]), np.array([r[2] for r in read]))
     error = score(offline.truth, moved(live, offline.transform))
     assert error['mean'] == pytest.approx(offline.scores['ekf']['mean'], abs=0.003)
-
-
-def passed_on(bench, chain):
-    """Sends the messages of the test drive, and yields each when it came through the chain."""
-    sent = {each.topic_name: each for each in bench.node.publishers}
-    omnicam, sfa, ekf = (node.monitors for node in chain)
-    through = {
-        '/odom': [ekf['odom']],
-        '/panorama_raw/compressed': [omnicam['image_raw/compressed'], sfa['panorama'], ekf[SEEN]],
-    }
-    for topic, _, data, _ in records(TEST, '/odom', '/panorama/compressed'):
-        topic = '/panorama_raw/compressed' if topic.startswith('/panorama') else topic
-        message = deserialize_message(data, KINDS[topic])
-        due = [monitor.received + 1 for monitor in through[topic]]
-        sent[topic].publish(message)
-        assert until(lambda: [each.received for each in through[topic]] == due)  # noqa: B023
-        yield message
 
 
 def record(folder, *topics):

@@ -289,16 +289,13 @@ class TeachNode(LocalizationNode):
             given.append(('--config', self._config_file))
         return [command, *words, *(word for pair in given for word in pair)]
 
-    def _start_worker(self, *words: str | Path) -> None:
-        self._worker = Worker(words, self._folder / 'log')
-
     def _look(self) -> None:
         """Inspect what is recorded, as often as the share of a core allows."""
         if steady_s() < self._next_look_s or not self._recorder or not self._recorder.counts:
             return
         report = self._folder / 'report.json'
         report.unlink(missing_ok=True)
-        self._start_worker(*self._commands('inspect', self._recorder.folder, '--json', report))
+        self._worker = Worker(self._commands('inspect', self._recorder.folder, '--json', report))
 
     def _looked(self, worker: Worker) -> None:
         """Publish what `inspect` found."""
@@ -396,7 +393,7 @@ class TeachNode(LocalizationNode):
         self._is_training = True
         self._problem = ''
         outputs = '--output', self._model, '--json', self._judgment
-        self._start_worker(*words, *drives, *outputs, *update)
+        self._worker = Worker([*words, *drives, *outputs, *update])
         return f'training on {", ".join(map(str, drives))}; see teach/state'
 
     def _cancel(self, _: Any) -> str:
