@@ -162,8 +162,8 @@ class BagReport:
     `camera` the kind of camera that they show, `lens` a sentence about its lens, which the settings
     describe or not (`is_described`). `cameras` is one about several that make a panorama;
     `image_topic` is the first of theirs. `drives` are the poses (M, 3) of images with `odometry` in
-    each unbroken part of it; `motion` compares odometry, images and gyroscope; `tilt` is that of
-    the ground.
+    each unbroken part of it, as corrected; `motion` compares odometry, images and gyroscope; `tilt`
+    is that of the ground.
     """
 
     path: str
@@ -487,7 +487,7 @@ class _Survey:
         broken = report.motion.odometry
         report.odometry = odometry
         part = broken.part[np.searchsorted(broken.stamps_ns[1:-1], near, 'right')]
-        report.drives = np.split(odometry.trajectory.at(near), np.flatnonzero(np.diff(part)) + 1)
+        report.drives = np.split(broken.trajectory.at(near), np.flatnonzero(np.diff(part)) + 1)
 
     def _compared(self, odometry: Odometry, stamps: Stamps, views: Sequence[_View]) -> MotionCheck:
         """The comparison of odometry, gyroscope, and images at stamps (N,)."""

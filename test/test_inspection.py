@@ -50,10 +50,12 @@ def eight(share):
 
 
 def cross(share):
-    """Along x and back to the middle, then along y to both sides."""
-    driven = np.array([0, 30, 44.7, 59.7, 89.7])
-    stops = (-15, 15, 0.3, 0.3, 0.3), (0, 0, 0, 15, -15)
-    return tuple(np.interp(share * driven[-1], driven, axis) for axis in stops)
+    """Along x and back to the middle, then along y to both sides; it turns within 3 m."""
+    driven = np.linspace(0, 98, 981)
+    headings = np.interp(driven, [30, 33, 48, 51, 66, 69], np.pi * np.array([0, 1, 1, 0.5, 0.5, 1.5]))
+    path = np.cumsum(np.exp(1j * headings)) * 0.1
+    at = np.interp(share * driven[-1], driven, path)
+    return at.real, at.imag
 
 
 def write(
@@ -119,6 +121,14 @@ def test_it_gives_the_reason_why_a_drive_is_not_enough(options, reason, tmp_path
     report = inspect(write(tmp_path / 'bag', **options), config=ENOUGH)
     assert reason in ' '.join(report.lacks), report.lacks
     assert f'not enough to train on: {report.lacks[0]}' in report.as_text()
+
+
+def test_odometry_that_starts_again_at_zero_drives_no_further(tmp_path):
+    def again(share):
+        return 30 * (share % 0.5), 0.0
+
+    report = inspect(write(tmp_path / 'bag', route=again, speed=0.375))
+    assert path_length(report.places) == pytest.approx(30, abs=0.2)
 
 
 def test_a_camera_that_is_described_may_look_like_any_other(tmp_path):

@@ -6,49 +6,49 @@ import errno
 import os
 import signal
 import subprocess
+import time
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import pytest
-from page_tables import ROOT
 
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.recorder import BagRecorder
 from sfa_localization.data.errors import BagError
-from sfa_localization.inspection import inspect
+from sfa_localization.data.run import Trajectory
+from sfa_localization.evaluation import evaluate, moved, score
+from sfa_localization.fusion.status import Level
+from sfa_localization.inspection import inspect, path_length
 from sfa_localization.place_model import PlaceModel
 
 pytest.importorskip('rclpy')
 
 import rclpy
+from builtin_interfaces.msg import Time
 from nav_msgs.msg import OccupancyGrid, Odometry
-from rclpy.serialization import deserialize_message
 from ros_bench import start_process, until
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image, Imu
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from taught_drives import (
+    SAMPLE,
+    TEST,
+    driver,
+    passed_on,
+    records,
+    start_chain,
+    start_teaching,
+)
 from visualization_msgs.msg import MarkerArray
 
-from sfa_localization.nodes.ekf_node import EkfNode
+from sfa_localization.nodes.conversions import read_odometry
 from sfa_localization.nodes.lifecycle import latched_qos
-from sfa_localization.nodes.omnicam_node import OmnicamNode
-from sfa_localization.nodes.sfa_node import SfaNode
 from sfa_localization.nodes.teach_node import TeachNode
 from sfa_localization.nodes.worker import Worker
 
 pytestmark = pytest.mark.ros
-KINDS = {'/odom': Odometry, '/imu': Imu, '/panorama_raw/compressed': CompressedImage}
-SAMPLE = ROOT / 'bags/sample'
-
-
-def records(path, *topics):
-    """Topic, type, bytes and time of the messages of a bag."""
-    with Bag(path) as bag:
-        assert bag.problems == []
-        return [
-            (topic.name, topic.kind, bytes(data), at_ns)
-            for topic, at_ns, data in bag.recording.messages(topics or [*bag.topics])
-        ]
 
 
 def test_a_recorded_bag_holds_the_same_messages_also_after_it_went_on(tmp_path):
@@ -61,6 +61,8 @@ def test_a_recorded_bag_holds_the_same_messages_also_after_it_went_on(tmp_path):
     assert len([*folder.glob('*.mcap')]) == 1
     with Bag(folder) as bag:
         assert sum(topic.count for topic in bag.topics.values()) == 300
+        cut = 'drive_0.mcap: was not closed, as where the power was cut: read as far as it goes; '
+        assert bag.problems == [f'{cut}`mcap recover` repairs it']
     second = BagRecorder(folder)
     for message in messages[300:]:
         second.write(*message)
@@ -110,13 +112,13 @@ def is_running(pid):
     return stat.exists() and stat.read_text().rpartition(') ')[2][0] != 'Z'
 
 
-def test_a_command_ends_with_a_node_that_is_killed(tmp_path):
+def test_a_command_ends_with_a_node_that_is_killed():
     code = (
-        'import sys, time; from pathlib import Path; from sfa_localization.nodes.worker import '
-        "Worker; worker = Worker(['play', sys.argv[1], '--wait', '1000'], Path(sys.argv[2])); "
+        'import sys, time; from sfa_localization.nodes.worker import '
+        "Worker; worker = Worker(['play', sys.argv[1], '--wait', '1000']); "
         'print(worker._process.pid, flush=True); time.sleep(1000)'
     )
-    node = start_process('-c', code, SAMPLE, tmp_path / 'log', stdout=subprocess.PIPE)
+    node = start_process('-c', code, SAMPLE, stdout=subprocess.PIPE)
     pid = int(node.stdout.readline())
     assert until(lambda: b'sfa_localization' in Path(f'/proc/{pid}/cmdline').read_bytes())
     assert is_running(pid)
@@ -126,11 +128,11 @@ def test_a_command_ends_with_a_node_that_is_killed(tmp_path):
 
 
 def test_a_signal_is_named_in_place_of_the_progress(tmp_path):
-    worker = Worker(['play', SAMPLE, '--wait', '1000'], tmp_path / 'log')
+    worker = Worker(['play', SAMPLE, '--wait', '1000'])
     os.kill(worker._process.pid, signal.SIGKILL)
     assert until(lambda: worker.code is not None)
     assert worker.failure() == 'SIGKILL ended it, as by a system without memory'
-    worker = Worker(['play', tmp_path / 'none'], tmp_path / 'log')
+    worker = Worker(['play', tmp_path / 'none'])
     assert until(lambda: worker.code is not None)
     assert worker.failure() == worker.last_line() and 'no such bag' in worker.failure()
 
@@ -148,45 +150,16 @@ def test_a_disk_that_cannot_keep_the_bag_is_named(tmp_path):
 
 @pytest.fixture
 def taught(bench, tmp_path):
-    output = str(tmp_path / 'garden.npz')
-    return bench.run(TeachNode, output=output, share=1.0, localize=True)
+    return start_teaching(bench, tmp_path / 'garden.npz')
 
 
 @pytest.fixture
 def chain(bench, tmp_path):
-    """The three nodes, which wait for a model."""
-    images = ['--ros-args', '-r', 'image_raw/compressed:=/panorama_raw/compressed']
-    model = str(tmp_path / 'garden.npz')
-    waiting = {'autostart': False}
-    options = {'cli_args': images}
-    return [
-        bench.run(
-            OmnicamNode, options=options, image_transport='compressed', model=model, **waiting
-        ),
-        bench.run(SfaNode, model=model, **waiting),
-        bench.run(EkfNode, **waiting),
-    ]
+    return start_chain(bench, tmp_path / 'garden.npz')
 
 
 def call(bench, name):
     return bench.call(Trigger, f'teach_node/{name}', Trigger.Request())
-
-
-def driver(bench, counted):
-    """Sends recorded messages through DDS, as fast as they are counted."""
-    create = bench.node.create_publisher
-    topics = {topic: create(kind, topic, 1000) for topic, kind in KINDS.items()}
-    assert until(lambda: all(each.get_subscription_count() for each in topics.values()))
-
-    def drive(messages):
-        before = counted()
-        for number, (topic, _, data, _) in enumerate(messages, before + 1):
-            topic = '/panorama_raw/compressed' if topic.startswith('/panorama') else topic
-            topics[topic].publish(deserialize_message(data, KINDS[topic]))
-            assert until(lambda: counted() > number - 40)  # noqa: B023
-        assert until(lambda: counted() == before + len(messages))
-
-    return drive
 
 
 def test_a_drive_is_taught_and_learned(bench, chain, taught, tmp_path):
@@ -194,16 +167,23 @@ def test_a_drive_is_taught_and_learned(bench, chain, taught, tmp_path):
     grids = bench.listen(OccupancyGrid, 'teach/map', latched_qos())
     hints = bench.listen(MarkerArray, 'teach/hints', latched_qos())
     messages = records(SAMPLE, '/odom', '/imu', '/panorama/compressed')
-    third = len(messages) // 3
+    images = [n for n, (topic, *_) in enumerate(messages) if topic.startswith('/panorama')]
     drive = driver(bench, taught._recorder.counts.total)
-    drive(messages[:third])
-    assert until(lambda: 'not' in taught._said or 'few' in taught._said), taught._said
-    drive(messages[third:])
-    assert until(lambda: any('enough to train on' in each.data for each in said)), taught._said
-    assert 0 in grids[-1].data and hints[-1].markers[-1].text.startswith('enough')
+    # Two images more are enough, here and to `inspect`, which skips a single one after a pause.
+    drive(messages[: images[299]])
+    assert until(lambda: '299 images with odometry are few' in said[-1].data), said[-1].data
+    recorded = tmp_path / 'garden_drive1'
+    (few,) = inspect(recorded).lacks
+    assert few in said[-1].data and not any('enough to' in each.data for each in said)
+    drive(messages[images[299] : images[301]])
+    assert until(lambda: 'enough to train on' in said[-1].data), said[-1].data
+    assert inspect(recorded).lacks == []
+    assert until(lambda: hints[-1].markers[-1].text.startswith('enough'))
+    assert until(lambda: 0 in grids[-1].data)
+    drive(messages[images[301] :])
     assert call(bench, 'finish').success
     assert until(lambda: 'is written. The map' in said[-1].data, 300.0), said[-1].data
-    report = inspect(tmp_path / 'garden_drive1')
+    report = inspect(recorded)
     assert report.lacks == [] and report.problems == []
     assert {name: topic.count for name, topic in ((t.name, t) for t in report.topics)} == {
         '/odom': 3176, '/imu': 3176, '/panorama_raw/compressed': 427,
@@ -213,26 +193,31 @@ def test_a_drive_is_taught_and_learned(bench, chain, taught, tmp_path):
     answer = call(bench, 'finish')
     assert not answer.success and '~/extend' in answer.message
     assert until(lambda: all(node.active for node in chain))
-    located = bench.listen(String, 'ekf/state', latched_qos())
-    inputs = [chain[2].monitors['odom'], chain[0].monitors['image_raw/compressed']]
-    localize(bench, inputs, located)
+    assert_localised_as_offline(bench, chain, model)
     assert call(bench, 'extend').success and taught._recorder.folder.name == 'garden_drive2'
     assert call(bench, 'cancel').success
 
 
-def localize(bench, inputs, located):
-    """The test drive, until the robot is localised: within two meters of driving and a turn."""
-    sent = {each.topic_name: each for each in bench.node.publishers}
-    messages = records(ROOT / 'bags/sample_test', '/odom', '/panorama/compressed')
-    for topic, _, data, _ in messages:
-        topic = '/panorama_raw/compressed' if topic.startswith('/panorama') else topic
-        monitor = inputs[topic != '/odom']
-        due = monitor.received + 1
-        sent[topic].publish(deserialize_message(data, KINDS[topic]))
-        assert until(lambda: monitor.received >= due)  # noqa: B023
-        if located and located[-1].data == 'LOCALISED':
-            return
-    assert until(lambda: located[-1].data == 'LOCALISED', 5.0), located[-1].data
+def assert_localised_as_offline(bench, chain, model):
+    """On the test drive: by the first image after two meters, with the error of `evaluate`."""
+    located = bench.listen(String, 'ekf/state', latched_qos())
+    fused = bench.listen(Odometry, 'ekf/odometry')
+    driven, localised = [], []
+    for message in passed_on(bench, chain):
+        if isinstance(message, Odometry):
+            driven.append(read_odometry(message)[2][:2])
+        else:
+            # Between two callbacks, the image is fused.
+            bench.do(lambda: localised.append(chain[2].status().level is Level.LOCALISED))
+            if localised.count(True) == 1 and localised[-1]:
+                assert path_length(np.array(driven)) < 2.25  # images are 0.21 m apart
+    assert any(localised) and until(lambda: located[-1].data == 'LOCALISED')
+    offline = evaluate(model, TEST, align_bags=[SAMPLE])
+    assert until(lambda: len(fused) == offline.scores['ekf']['n'])
+    read = [read_odometry(message) for message in fused]
+    live = Trajectory(np.array([r[0] for r in read]), np.array([r[2] for r in read]))
+    error = score(offline.truth, moved(live, offline.transform))
+    assert error['mean'] == pytest.approx(offline.scores['ekf']['mean'], abs=0.003)
 
 
 def record(folder, *topics):
@@ -247,6 +232,7 @@ def test_only_what_was_not_taught_goes_on(bench, tmp_path):
     output = tmp_path / 'garden.npz'
     record(tmp_path / 'garden_drive1')
     output.touch()
+    (tmp_path / 'garden_teach').mkdir()  # by a node that was killed
     node = bench.run(TeachNode, output=str(output))
     said = bench.listen(String, 'teach/state', latched_qos())
     assert until(
@@ -256,6 +242,7 @@ def test_only_what_was_not_taught_goes_on(bench, tmp_path):
     assert call(bench, 'extend').message.endswith('garden_drive2')
     assert call(bench, 'cancel').success and not any((tmp_path / 'garden_drive2').iterdir())
     bench.end(node)
+    assert not (tmp_path / 'garden_teach').exists()
     os.utime(output, (1.0, 1.0))
     node = bench.run(TeachNode, output=str(output))
     goes_on = f'waiting for images and odometry to go on with {tmp_path}/garden_drive1'
@@ -268,6 +255,34 @@ def test_only_what_was_not_taught_goes_on(bench, tmp_path):
     answer = call(bench, 'finish')
     assert answer.success and call(bench, 'cancel').success
     assert said[-1].data == f'canceled; {tmp_path}/garden_drive1: kept for ~/finish'
+
+
+def test_a_clock_that_was_set_back_begins_a_drive_and_files_of_the_future_keep_their_order(
+    bench, tmp_path
+):
+    """As after a power cut, of a board whose clock does not go on."""
+    record(tmp_path / 'garden_drive1')  # at the sample's time
+    record(tmp_path / 'garden_drive2')
+    output = tmp_path / 'garden.npz'
+    output.touch()
+    for ahead_s, path in enumerate(
+        [tmp_path / 'garden_drive1', output, tmp_path / 'garden_drive2']
+    ):
+        later_s = time.time() + 3600 + ahead_s
+        for file in [*path.glob('*.mcap')] or [path]:
+            os.utime(file, (later_s, later_s))
+    node = bench.run(TeachNode, output=str(output), use_sim_time=True)
+    assert node._untaught() == [tmp_path / 'garden_drive2']
+    assert output.stat().st_mtime < time.time()
+    said = bench.listen(String, 'teach/state', latched_qos())
+    bench.publish_until(
+        '/clock', Clock(clock=Time(sec=1)), lambda: node.get_clock().now().nanoseconds
+    )
+    again = f'the clock was set back: {tmp_path}/garden_drive3 is a drive of its own'
+    bench.publish_until('/odom', Odometry(), lambda: any(again in each.data for each in said))
+    bench.publish_until('/odom', Odometry(), lambda: node._recorder.counts)
+    bench.do(node._end_recording)
+    assert node._untaught() == [tmp_path / 'garden_drive2', tmp_path / 'garden_drive3']
 
 
 def test_a_drive_that_ended_with_the_disk_is_finished(bench, taught):

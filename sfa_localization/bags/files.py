@@ -80,7 +80,7 @@ def describe(error: Exception) -> str:
 
 
 class McapFile:
-    """One .mcap file, chunk by chunk; `start_ns` is the first reception.
+    """One .mcap file, chunk by chunk; `start_ns` and `end_ns` are the first and last reception.
 
     Raises BagError where it holds no message.
     """
@@ -90,16 +90,17 @@ class McapFile:
         self._problems = problems
         self._file = path.open('rb')
         self.start_ns = _LATEST
+        self.end_ns = 0
         self.topics = dict[int, Topic]()
-        damage = self._read_index()
+        is_whole = self._read_index()
         if not self.topics:
             self._scan()
-        if damage and not self.topics:
+        if not (is_whole or self.topics):
             self.close()
-            raise BagError(f'{path}: holds no readable message ({damage}); try `mcap recover`')
-        if damage:
-            problems.append(f'{path.name}: has no index, recording cut off? ({damage}); '
-                            'read to the cut; `mcap recover` repairs it')  # fmt: skip
+            raise BagError(f'{path}: holds no readable message; try `mcap recover`')
+        if not is_whole:
+            problems.append(f'{path.name}: was not closed, as where the power was cut: read as far '
+                            'as it goes; `mcap recover` repairs it')  # fmt: skip
 
     def close(self) -> None:
         """Release the file."""
@@ -115,17 +116,18 @@ class McapFile:
                     if start_ns <= stamp_ns < _LATEST:
                         yield topic, stamp_ns, record.data
 
-    def _read_index(self) -> str:
-        """Read the topics from the end of the file; return its damage in words."""
+    def _read_index(self) -> bool:
+        """Read the topics from the end of the file; return whether they are there."""
         try:
             summary = SeekingReader(self._file, record_size_limit=_LARGEST).get_summary()
-        except Exception as error:  # a parser of foreign bytes fails in many ways
-            return describe(error)
+        except Exception:  # a parser of foreign bytes fails in many ways
+            return False
         if summary is not None and summary.statistics is not None:
             self.start_ns = summary.statistics.message_start_time
+            self.end_ns = summary.statistics.message_end_time
             counts = summary.statistics.channel_message_counts
             self._define(summary.channels, summary.schemas, counts)
-        return ''
+        return True
 
     def _scan(self) -> None:
         """Count the messages of a file without an index."""
@@ -140,6 +142,7 @@ class McapFile:
             elif isinstance(record, Message):
                 counts[record.channel_id] += 1
                 self.start_ns = min(self.start_ns, record.log_time)
+                self.end_ns = max(self.end_ns, record.log_time)
         self._define(channels, schemas, counts)
 
     def _define(

@@ -11,12 +11,14 @@ from __future__ import annotations
 import importlib
 import json
 import math
+import os
 import re
+import shutil
+import time
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -33,6 +35,7 @@ from sfa_localization.bags.reader import KINDS, Bag
 from sfa_localization.bags.recorder import BagRecorder, files_with_messages
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.data.errors import BagError, ConfigError, LocalizationError
+from sfa_localization.data.events import CLOCK_JUMP_NS
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.image_topics import TRANSPORTS, without_transport
 from sfa_localization.mapping.driven_ground import DrivenGround
@@ -55,6 +58,10 @@ _FLAGS = {KINDS[name].flag: f"the parameter '{name}'" for name in ('image', 'odo
 """Options of the commands, as this node names them."""
 
 
+def _changed_ns(file: Path) -> int:
+    return file.stat().st_mtime_ns
+
+
 class TeachNode(LocalizationNode):
     """Records its inputs, publishes what to drive still, and trains a model of it."""
 
@@ -64,6 +71,7 @@ class TeachNode(LocalizationNode):
         self._recorder: BagRecorder | None = None
         self._worker: Worker | None = None
         self._recorded: dict[str, Any] = {}
+        self._scratch = ExitStack()
 
     def find_files(self, words: Sequence[str]) -> None:
         """The parameter file is also that of the commands."""
@@ -75,14 +83,21 @@ class TeachNode(LocalizationNode):
         if not output:
             raise ConfigError("parameter 'output' is empty: name the model to write, GARDEN.npz")
         self._model = Path(output).expanduser()
-        self._folder = TemporaryDirectory(prefix='teach-')
-        self._judgment = Path(self._folder.name) / 'judgment.json'
+        # Beside the model, so that the next start finds what a kill left.
+        self._folder = self._model.with_name(f'{self._model.stem}_teach')
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f'{self._folder}: cannot be written: {error.strerror}') from None
+        self._scratch.callback(shutil.rmtree, self._folder, ignore_errors=True)
+        self._judgment = self._folder / 'judgment.json'
         self._is_training = False
         self._findings: dict[str, Any] = {}
         self._next_look_s = 0.0
         self._problem = ''
         self._said = ''
         self._topics: dict[str, str] = {}
+        self._date_before_now()
         if self._untaught() or not self._model.exists():
             self._start(next(reversed(self._drives()), self._drive(1)))
         latched = latched_qos()
@@ -108,6 +123,7 @@ class TeachNode(LocalizationNode):
             self._worker.stop()
             self._worker = None
         self._end_recording()
+        self._scratch.close()
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         counts = {} if self._recorder is None else self._recorder.counts
@@ -127,19 +143,34 @@ class TeachNode(LocalizationNode):
         numbers = sorted(int(match[1]) for match in matches if match)
         return [folder for folder in map(self._drive, numbers) if files_with_messages(folder)]
 
+    def _next_drive(self) -> Path:
+        last = next(reversed(self._drives()), None)
+        return self._drive(1 + int(last.name.rpartition('_drive')[2]) if last else 1)
+
     def _untaught(self) -> list[Path]:
         """The drives that were recorded after the model was written."""
-        written_s = self._model.stat().st_mtime if self._model.exists() else 0.0
+        written_ns = _changed_ns(self._model) if self._model.exists() else 0
         return [
             folder
             for folder in self._drives()
-            if files_with_messages(folder)[-1].stat().st_mtime > written_s
+            if _changed_ns(files_with_messages(folder)[-1]) > written_ns
         ]
+
+    def _date_before_now(self) -> None:
+        """Date files of the future before now, in their order: this clock was set back."""
+        files = [files_with_messages(folder)[-1] for folder in self._drives()]
+        files += [self._model] if self._model.exists() else []
+        now_ns = time.time_ns()
+        ahead = sorted((file for file in files if _changed_ns(file) > now_ns), key=_changed_ns)
+        for number, file in enumerate(ahead):
+            at_ns = now_ns - (len(ahead) - number) * 1_000_000
+            os.utime(file, ns=(at_ns, at_ns))
 
     def _start(self, folder: Path) -> None:
         """Record into a folder."""
         self._findings = {}
         self._problem = ''
+        self._is_set_back = False
         with suppress(BagError), Bag(folder) as bag:  # of a new drive there is nothing to read
             self._topics = {without_transport(topic): topic for topic in bag.topics}
         self._recorder = BagRecorder(folder)
@@ -200,9 +231,12 @@ class TeachNode(LocalizationNode):
         self._recorded[topic] = self.subscribe(message_class, topic, write, qos, raw=True)
 
     def _write(self, topic: str, kind: str, data: bytes) -> None:
-        if self._recorder is None:
+        if self._recorder is None or self._is_set_back:
             return
         now_ns = self.get_clock().now().nanoseconds
+        if 0 < now_ns < self._recorder.end_ns - CLOCK_JUMP_NS:
+            self._is_set_back = True
+            return
         try:
             self._recorder.write(topic, kind, data, now_ns)
         except BagError as error:
@@ -214,11 +248,21 @@ class TeachNode(LocalizationNode):
         self._recorder = None
         self.get_logger().error(self._problem)
 
+    def _begin_anew(self) -> None:
+        """Record a drive of its own: what was recorded is later than now."""
+        self._end_recording()
+        drive = self._next_drive()
+        self._start(drive)
+        self._problem = f'the clock was set back: {drive} is a drive of its own'
+        self.get_logger().warning(self._problem)
+
     # Looking, and training.
 
     def _step(self) -> None:
         """Once a second: record new topics, look at the drive, say how far all is."""
         if self._recorder is not None:
+            if self._is_set_back:
+                self._begin_anew()
             self._listen()
             try:
                 self._recorder.flush()
@@ -246,22 +290,19 @@ class TeachNode(LocalizationNode):
             given.append(('--config', self._config_file))
         return [command, *words, *(word for pair in given for word in pair)]
 
-    def _start_worker(self, *words: str | Path) -> None:
-        self._worker = Worker(words, Path(self._folder.name) / 'log')
-
     def _look(self) -> None:
         """Inspect what is recorded, as often as the share of a core allows."""
         if steady_s() < self._next_look_s or not self._recorder or not self._recorder.counts:
             return
-        report = Path(self._folder.name) / 'report.json'
+        report = self._folder / 'report.json'
         report.unlink(missing_ok=True)
-        self._start_worker(*self._commands('inspect', self._recorder.folder, '--json', report))
+        self._worker = Worker(self._commands('inspect', self._recorder.folder, '--json', report))
 
     def _looked(self, worker: Worker) -> None:
         """Publish what `inspect` found."""
         share = self.settings(TeachNodeConfig).share
         self._next_look_s = steady_s() + worker.elapsed_s * (1 / share - 1)
-        report = Path(self._folder.name) / 'report.json'
+        report = self._folder / 'report.json'
         if self._recorder is None:
             return
         if not report.exists():
@@ -353,7 +394,7 @@ class TeachNode(LocalizationNode):
         self._is_training = True
         self._problem = ''
         outputs = '--output', self._model, '--json', self._judgment
-        self._start_worker(*words, *drives, *outputs, *update)
+        self._worker = Worker([*words, *drives, *outputs, *update])
         return f'training on {", ".join(map(str, drives))}; see teach/state'
 
     def _cancel(self, _: Any) -> str:
@@ -372,10 +413,9 @@ class TeachNode(LocalizationNode):
     def _extend(self, _: Any) -> str:
         if self._recorder is not None or self._is_training:
             raise LocalizationError('the last drive is not finished: call ~/finish or ~/cancel')
-        last = next(reversed(self._drives()), None)
-        number = 1 + int(last.name.rpartition('_drive')[2]) if last else 1
-        self._start(self._drive(number))
-        return f'recording into {self._drive(number)}'
+        drive = self._next_drive()
+        self._start(drive)
+        return f'recording into {drive}'
 
     def _trained(self, worker: Worker) -> None:
         """Say how the training ended; the nodes get the model as soon as they are there."""

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from sfa_localization.nodes.monitor import steady_s
 
@@ -30,17 +31,18 @@ again never meets the work of the one before."""
 
 
 class Worker:
-    """Runs a command, as of the command line; its output goes to the file `log`."""
+    """Runs a command, as of the command line; its output goes to a file without a name, which a
+    killed node does not leave.
+    """
 
-    def __init__(self, words: Sequence[str | Path], log: Path) -> None:
+    def __init__(self, words: Sequence[str | Path]) -> None:
         self.start_s = steady_s()
-        self._log = log
+        self._log = TemporaryFile()  # noqa: SIM115 - closed with this object
         command = [sys.executable, '-c', _BOUND, str(os.getpid()), *map(str, words)]
-        with log.open('wb') as output:
-            self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )  # fmt: skip
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=self._log, stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )  # fmt: skip
         with suppress(OSError):  # it may have ended
             os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICE)
 
@@ -56,7 +58,9 @@ class Worker:
 
     def last_line(self) -> str:
         """What it printed last; progress bars return to the start of their line."""
-        text = self._log.read_bytes()[-_LAST_BYTES:].decode(errors='replace')
+        written = os.fstat(self._log.fileno()).st_size
+        last = os.pread(self._log.fileno(), _LAST_BYTES, max(written - _LAST_BYTES, 0))
+        text = last.decode(errors='replace')
         lines = [line.strip() for line in text.replace('\r', '\n').split('\n')]
         return next(filter(None, reversed(lines)), '')
 

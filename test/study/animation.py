@@ -90,10 +90,8 @@ def draw(figure, path, shots, k):
     below.set_aspect('equal')
     below.plot(*path.T, color='0.85', lw=3)
     below.plot(*trail[:, :2].T, '.', color=BLUE, ms=3)
-    for pose, color, size in ((shot.true, GRAY, 10), (shot.pose, BLUE, 6)):
-        ahead = pose[:2] + 0.35 * np.array([math.cos(pose[2]), math.sin(pose[2])])
-        below.plot(*np.stack([pose[:2], ahead]).T, color=color, lw=2)
-        below.plot(*pose[:2], 'o', color=color, ms=size, mfc='none' if size > 6 else color)
+    draw_robot(below, shot.true, GRAY, 10)
+    draw_robot(below, shot.pose, BLUE, 6)
     values, vectors = np.linalg.eigh(shot.spread)
     width, height = 2 * SIGMAS * np.sqrt(values[::-1])
     angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
@@ -107,11 +105,17 @@ def draw(figure, path, shots, k):
         figure.text(0.8, 0.77, 'kidnapped!', color=COLORS['LOST'], size='x-large')
 
 
-def film(output, path, shots):
-    """Write an animated WebP that begins anew."""
-    figure = Figure((7.2, 4.72), layout='constrained')
-    frames = FuncAnimation(figure, lambda k: draw(figure, path, shots, k), len(shots))
-    frames.save(output, PillowWriter(PACE / STEP_S))
+def draw_robot(axes, pose, color, size):
+    """A circle with its heading; a small one is filled."""
+    ahead = pose[:2] + 0.35 * np.array([math.cos(pose[2]), math.sin(pose[2])])
+    axes.plot(*np.stack([pose[:2], ahead]).T, color=color, lw=2)
+    axes.plot(*pose[:2], 'o', color=color, ms=size, mfc='none' if size > 6 else color)
+
+
+def film(output, figure, draw, count, rate_hz):
+    """Write an animated WebP that begins anew; `draw` draws a frame by its number."""
+    frames = FuncAnimation(figure, lambda k: draw(figure, k), count)
+    frames.save(output, PillowWriter(rate_hz))
 
 
 def main():
@@ -121,7 +125,16 @@ def main():
     arguments = parser.parse_args()
     world = two_laps()
     shots = filmed(FAULTS['kidnapped'].messages(world), world.times_ns[0])
-    film(arguments.output, world.true[:, :2], shots)
+    figure = Figure((7.2, 4.72), layout='constrained')
+    path = world.true[:, :2]
+    rate_hz = PACE / STEP_S
+    film(
+        arguments.output,
+        figure,
+        lambda figure, k: draw(figure, path, shots, k),
+        len(shots),
+        rate_hz,
+    )
 
 
 if __name__ == '__main__':
