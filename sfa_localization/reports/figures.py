@@ -25,6 +25,8 @@ FEATURE_LIMIT = 2.0
 FIRING_CAPTION = 'Slow features at the places of the images: good ones change smoothly'
 MARGIN_M = 0.5
 """Margin around places in firing maps (m)."""
+SQUARE = 5.4, 4.6
+"""Inches of a map: its text of 10 points is 10 pixels high on a phone of 390 pixels."""
 DOTS_PER_INCH = 130
 """Resolution of the figures: sharp on a screen, in small files."""
 

@@ -52,7 +52,7 @@ th, td { padding: 0.2rem 0.7rem; border-bottom: 1px solid var(--line); text-alig
 th:first-child, td:first-child { text-align: left; }
 @media (max-width: 40rem) {
   body { padding: 0.6rem; }
-  table { font-size: 0.85rem; }
+  table { font-size: 0.8rem; }
   th, td { padding: 0.2rem 0.3rem; }
   .broad img { max-width: none; height: 22rem; width: auto; }
 }

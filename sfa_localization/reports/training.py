@@ -160,7 +160,7 @@ def advice(trained: Trained, places: Array) -> list[str]:
 
 def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
     """Draw where images were taken, (M, 2) m, on the expected error around them."""
-    figure = Figure(figsize=(7.0, 6.0), layout='constrained')
+    figure = Figure(figsize=figures.SQUARE, layout='constrained')
     axes = figure.subplots()
     expected = trained.metric.forecast
     local = expected.local
@@ -186,7 +186,7 @@ def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
 
 def line_fits_figure(path: Path, trained: Trained, places: Array) -> None:
     """Draw every segment by odometry (places (M, 2) m) and by the slow features."""
-    figure = Figure(figsize=(7.0, 6.0), layout='constrained')
+    figure = Figure(figsize=figures.SQUARE, layout='constrained')
     axes = figure.subplots()
     predicted = places - trained.metric.residuals
     start = 0
