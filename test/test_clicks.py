@@ -27,15 +27,21 @@ const card = document.querySelector('.moment:not([hidden])');
 return {stamp: card.dataset.stamp, text: card.innerText, shown: [...card.querySelectorAll('img')]
   .map(image => [image.alt, image.naturalWidth, image.clientWidth]),
   cards: document.querySelectorAll('.moment:not([hidden])').length};"""
-# The pixel of the point of a trace at which a time is marked, in the window.
+# The pixel, in the window, of the point of a trace that is farthest from points of other times; and
+# its time.
 PIXEL = """
-const [number, name, time] = arguments;
-const plot = document.querySelectorAll('.js-plotly-plot')[number];
+const [number, name] = arguments, plot = document.querySelectorAll('.js-plotly-plot')[number];
 plot.scrollIntoView({block: 'center'});
-const trace = plot.data.find(one => one.name === name), at = trace.customdata.indexOf(time);
-const of = plot.calcdata[plot.data.indexOf(trace)][at];
 const {xaxis, yaxis} = plot._fullLayout, box = plot.getBoundingClientRect();
-return [box.x + xaxis._offset + xaxis.l2p(of.x), box.y + yaxis._offset + yaxis.l2p(of.y)];"""
+const points = plot.data.flatMap((trace, k) => trace.customdata && (trace.yaxis || 'y') === 'y'
+  ? trace.customdata.map((time, at) => ({name: trace.name, time,
+      x: box.x + xaxis._offset + xaxis.l2p(plot.calcdata[k][at].x),
+      y: box.y + yaxis._offset + yaxis.l2p(plot.calcdata[k][at].y)})) : []);
+const away = one => Math.min(...points.filter(other => Math.abs(other.time - one.time) > 0.1)
+  .map(other => Math.hypot(other.x - one.x, other.y - one.y)));
+const own = points.filter(one => one.name === name);
+const best = own.reduce((one, other) => away(other) > away(one) ? other : one);
+return [best.x, best.y, best.time];"""
 MARKED = """
 return [...document.querySelectorAll('.js-plotly-plot')].flatMap(plot => plot.data
   .filter(one => one.customdata).map(one => one.customdata[(one.selectedpoints || [-1])[0]]));"""
@@ -89,12 +95,13 @@ def open_page(browser, folder, width, scheme):
     assert not [entry for entry in browser.get_log('browser') if entry['level'] == 'SEVERE']
 
 
-def click(browser, number, name, time):
-    """Click the point of a curve at a time, in one of the plots."""
-    x, y = browser.execute_script(PIXEL, number, name, time)
+def click(browser, number, name):
+    """Click a point of a curve in one of the plots; return its time, s."""
+    x, y, seconds = browser.execute_script(PIXEL, number, name)
     mouse = {'x': x, 'y': y, 'button': 'left', 'clickCount': 1}
     for kind in ('mouseMoved', 'mousePressed', 'mouseReleased'):
         browser.execute_cdp_cmd('Input.dispatchMouseEvent', {'type': kind, **mouse})
+    return seconds
 
 
 def wait_for(browser, condition):
@@ -111,10 +118,9 @@ def test_a_click_on_a_point_shows_its_image_and_its_keyframe(width, scheme, brow
     """In the plot of the path, in that of the errors, by a button, and by the slider."""
     folder, _, moments = evaluated
     open_page(browser, folder, width, scheme)
-    for number, name, row in ((0, 'images', 40), (1, 'SFA, one image each', 75)):
-        moment = moments[row]
-        seconds = round(moment.seconds, 3)
-        click(browser, number, name, seconds)
+    for number, name in ((0, 'images'), (1, 'SFA, one image each')):
+        seconds = click(browser, number, name)
+        moment = min(moments, key=lambda one, at=seconds: abs(one.seconds - at))
         wait_for(browser, lambda _, at=moment: shown(browser)['stamp'] == str(at.stamp_ns))
         card = shown(browser)
         assert card['cards'] == 1 and f'at {moment.seconds:.2f} s' in card['text']
@@ -148,7 +154,7 @@ def test_the_slider_and_the_buttons_of_the_worst_images(browser, evaluated):
 
 
 def test_two_results_are_linked_in_the_same_plots(browser, evaluated, tmp_path):
-    _, result, moments = evaluated
+    _, result, _ = evaluated
     files = [tmp_path / 'before.json', tmp_path / 'after.json']
     for file in files:
         told = {**result.as_dict(), 'grade': 'good', 'sentence': 'right'}
@@ -156,8 +162,7 @@ def test_two_results_are_linked_in_the_same_plots(browser, evaluated, tmp_path):
         file.write_text(json.dumps({**told, 'curves': curves}))
     assert main(['evaluate', *map(str, files), '--report', str(tmp_path / 'report')]) == 0
     open_page(browser, tmp_path / 'report', 1280, 'dark')
-    seconds = round(moments[50].seconds, 3)
-    click(browser, 1, 'after.json: SFA, one image each', seconds)
+    seconds = click(browser, 1, 'after.json: SFA, one image each')
     wait_for(browser, lambda _: -1 not in browser.execute_script(MARKED))
     marked = np.array(browser.execute_script(MARKED))
     assert len(marked) == 5 + 8 and np.abs(marked - seconds).max() < 0.2
