@@ -61,8 +61,8 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'inspection': (CORE - {'sfa'}, NUMERIC | {'cv2'}),
     'filtering': ({'data', 'fusion'}, {'numpy'}),
     'reports': (
-        {'data', 'camera', 'training', 'inspection'} | METHOD,
-        {'numpy', 'matplotlib', 'PIL'},  # PIL comes with matplotlib
+        {'data', 'camera', 'keyframes', 'training', 'inspection'} | METHOD,
+        {'numpy', 'matplotlib', 'plotly', 'PIL'},  # PIL comes with matplotlib
     ),
     'nodes': (
         {'data', 'camera', 'fusion', 'bags', 'mapping', 'place_model', 'observer', 'config'},
@@ -80,7 +80,8 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
 # From these rooms only the settings may be imported, which need no ROS.
 SETTINGS_ONLY = {('config', 'nodes')}
 # Never at run time on the robot, nor in anything its nodes import.
-NOT_ON_THE_ROBOT = {'mdp', 'pickle', 'matplotlib', 'trimesh', 'embreex', 'rosbags', 'tqdm'}
+NOT_ON_THE_ROBOT = {'mdp', 'pickle', 'matplotlib', 'plotly', 'trimesh', 'embreex', 'rosbags',
+                    'tqdm'}  # fmt: skip
 OFFLINE = {f'{NAME}.{room}' for room in ('training', 'evaluation', 'updating', 'simulation')}
 # Modules that run code from the files that they read.
 UNSAFE = {'pickle', 'marshal', 'shelve', 'dill', 'joblib'}

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The pages of reports: one file each, complete, without scripts, legible on a phone."""
+"""The pages of reports: one file each, complete, legible on a phone. See test_clicks.py."""
 
 import base64
 import html
@@ -17,13 +17,18 @@ import pytest
 from cylinder_worlds import SMALL_RECIPE
 from numpy.testing import assert_allclose
 from places import lengths
+from scipy import stats
 from test_inspection import write as write_drive
 
 from sfa_localization.bags.drives import images_at
+from sfa_localization.bags.settings import TopicNames
 from sfa_localization.cli import main
 from sfa_localization.commands.options import noticed
+from sfa_localization.data.geometry import rotation
 from sfa_localization.data.run import Trajectory
-from sfa_localization.reports import evaluation, page, training
+from sfa_localization.evaluation import evaluate
+from sfa_localization.reports import evaluation, page, plots, training
+from sfa_localization.reports.moments import MOST, Estimate, moments_of
 
 FOREIGN = re.compile(r'<(script|link|iframe)|href=|srcset=|onload=|onclick=|url\(|@import')
 LARGEST = 1_500_000
@@ -32,11 +37,17 @@ PREFIX = re.compile('^(note|problem|corrected|not enough to train on|error|toget
 IMAGE = re.compile(r'<img[^>]* src="data:image/webp;base64,([^"]+)"[^>]*>')
 
 
-def read(folder):
-    """Headings, images and text of a page, which needs no other file, and is legible on a phone."""
+def read(folder, plots=False):
+    """Headings, images and text of a page, which needs no other file but for its plots, and is
+    legible on a phone.
+    """
     text = (folder / page.PAGE).read_text('utf-8')
+    assert text.count('<script src="plotly.min.js">') == plots
+    scripts = re.compile('<script.*?</script>', re.DOTALL)
+    text = scripts.sub('', text) if plots else text
     assert 'viewport' in text and 'prefers-color-scheme: dark' in text and not FOREIGN.search(text)
-    assert len(text) < LARGEST and text.count('<table') == text.count('<div class="wide"><table')
+    assert (folder / page.PAGE).stat().st_size < LARGEST
+    assert text.count('<table') == text.count('<div class="wide"><table')
     for tag in ('h2', 'p', 'table', 'tr', 'td', 'figure', 'div'):
         assert len(re.findall(f'<{tag}[ >]', text)) == text.count(f'</{tag}>'), tag
     raw = [np.frombuffer(base64.b64decode(data), np.uint8) for data in IMAGE.findall(text)]
@@ -123,49 +134,50 @@ def test_what_is_warned_of_is_kept_and_printed_once(capsys):
 
 @pytest.fixture
 def judged():
-    """A filter that drifts off to one side, and single images with one that is far off."""
-    stamps = np.arange(1, 101, dtype=np.int64) * 100_000_000
-    truth = np.column_stack([np.arange(100) / 10, np.zeros((100, 2))])
-    ekf, image = truth.copy(), truth.copy()
-    ekf[:, 1], image[30, 1] = np.arange(100) / 500, 3.0
+    """Scores and counts of a drive."""
     row = {'mean': 0.1, 'median': 0.1, 'p95': 0.2, 'rmse': 0.15, 'max': 0.3, 'n': 100}
     row['yaw_deg'] = {'mean': 1.0, 'median': 1.0, 'p95': 2.0}
-    poses = {'odometry': truth, 'sfa': image, 'ekf': ekf}
     used = {'used': 9, 'skipped': {}}
-    counts = {'images': {'used': 6, 'skipped': {'too <dark> & small': 3}}, 'odometry': used,
-              'observations': used,
-              'fusion': {'measurement: accepted': 9, 'measurement: outside the gate': 2},
-              'states_s': {'LOCALISED': 9.0, 'LOST': 1.0}, 'false_localised_s': 0.0}  # fmt: skip
-    estimates = {name: Trajectory(stamps, path) for name, path in poses.items()}
-    return estimates['odometry'], estimates, dict.fromkeys(estimates, row), counts
+    counts = {'images': used, 'odometry': used, 'observations': used, 'fusion': {},
+              'states_s': {'LOCALISED': 9.0}, 'false_localised_s': 0.0}  # fmt: skip
+    return dict.fromkeys(('odometry', 'sfa', 'ekf'), row), counts
 
 
-def test_the_page_of_an_evaluation(judged, tmp_path):
-    truth, estimates, scores, counts = judged
-    worst = evaluation.worst_of(truth, estimates['sfa'])
-    first, stamp_ns = next(iter(worst.items()))
-    assert first[:3] == (pytest.approx(3.0), 0.0, 3.0) and stamp_ns == 3_100_000_000
-    rng = np.random.default_rng(0)
-    pictures = dict.fromkeys(worst, rng.integers(0, 255, (9, 90, 3), np.uint8))
-    features = rng.standard_normal((100, 8))
-    evaluation.write_report(tmp_path, truth, estimates, scores, truth.poses[:, :2], features)
-    evaluation.write_evaluation_page(
-        tmp_path, 'a <model>', truth, estimates, scores, counts, pictures, ['aligned on a drive']
-    )
-    content = read(tmp_path)
-    assert content.headings == ['How far off?', 'Where is it weak?', 'May I trust it?',
-                                'What was rejected?', 'Worst images']  # fmt: skip
+def test_the_page_of_an_evaluation(trained, tmp_path):
+    """It shows images evenly over the drive and the worst ones, with poses in the truth's frame."""
+    model = trained.result.model
+    recipe = replace(SMALL_RECIPE, topics=TopicNames(ground_truth='/odom'))
+    found = evaluate(model, trained.bag, recipe=recipe)
+    counts = {**found.counts, 'images': {'used': 6, 'skipped': {'too <dark> & small': 3}}}
+    counts['fusion'] = {'measurement: accepted': 9, 'measurement: outside the gate': 2}
+    result = replace(found, counts=counts)
+    features = result.estimates['sfa'].poses[:, :2], result.features
+    notes = ['aligned on a drive']
+    evaluation.write_evaluation_page(tmp_path, 'a <model>', result, model, features, notes)
+    content = read(tmp_path, plots=True)
+    assert content.headings == [
+        'How far off?', 'Where, and what did it see?', 'Where is it weak?', 'May I trust it?',
+        'What was rejected?', 'Slow features',
+    ]  # fmt: skip
     for words in (
-        'images: 6 used; 3 skipped: too <dark> & small', 'a <model>', 'LOST 1.0 s',
-        '2 times measurement: outside the gate', 'aligned on a drive',
+        'images: 6 used; 3 skipped: too <dark> & small', 'a <model>', 'aligned on a drive',
+        '2 times measurement: outside the gate',
     ):  # fmt: skip
         assert words in content.text, 'escaped, and read back'
-    text = (tmp_path / page.PAGE).read_text('utf-8')
-    assert text.count('class="wide broad"') == 2, 'overview and errors'
+    shown = moments_of(result, model)
+    assert len(content.images) == 3 * len(shown) + 1 and len(shown) <= MOST
+    errors = np.hypot(*(result.estimates['sfa'].poses - result.truth.at(
+        result.estimates['sfa'].stamps_ns))[:, :2].T)  # fmt: skip
+    assert max(k.error_m(k.single) for k in shown) == pytest.approx(errors.max(), abs=1e-6)
+    for moment in shown:
+        pose = model.keyframes.poses[moment.match.row]
+        assert_allclose(moment.keyframe[:2], result.transform.apply(pose[None, :2])[0])
+        assert moment.match.correlation > 0.9, 'the drive is that of the training'
+        assert np.hypot(*(moment.keyframe - moment.truth)[:2]) < 1.0
 
 
 def test_the_answer_about_a_drive_follows_its_figures(judged):
-    _, _, scores, counts = judged
+    scores, counts = judged
     for change, wrong_s, level in (
         ({}, 0.0, page.GOOD), ({}, 2.0, page.BAD), ({'mean': 0.2}, 0.0, page.WEAK),
         ({'mean': None}, 0.0, page.BAD), ({'within_95': 0.5}, 0.0, page.WEAK),
@@ -238,27 +250,42 @@ TRUTH = path([5, 15], [[0, 0, 0], [10, 0, 0]])
 def test_errors_by_hand():
     """3-4-5 triangles. Headings wrap; unknown ones, and those before the truth, are left out."""
     estimate = path([4, 6, 7], [[9, 9, 9], [1 + 3, 4, np.radians(190)], [2, -5, np.nan]])
-    errors = evaluation.errors_of(TRUTH, estimate)
+    errors = plots.errors_of(TRUTH, estimate)
     assert_allclose(errors.seconds, [1, 2])
     assert_allclose(errors.position_m, [5, 5])
     assert_allclose(errors.heading_deg, [-170, np.nan])
+    curve = plots.curves_of(TRUTH, {'ekf': estimate})['ekf']
+    assert curve == {'seconds': [1.0, 2.0], 'x_m': [4.0, 2.0], 'y_m': [4.0, -5.0],
+                     'error_m': [5.0, 5.0], 'heading_deg': [-170.0, None]}  # fmt: skip
 
 
-def test_figures_show_paths_to_scale_and_tables_what_could_not_be_judged(tmp_path):
-    """A square path must come out as a square: equal axes."""
+def test_a_long_curve_keeps_its_largest_errors():
+    count = 10 * plots.POINTS
+    rng = np.random.default_rng(0)
+    stamps = np.arange(count) * 1_000_000
+    still = Trajectory(stamps, np.zeros((count, 3)))
+    poses = np.zeros((count, 3))
+    poses[:, 0] = rng.uniform(0, 0.1, count)
+    poses[[7, 4321], 0] = 2.0, 1.0
+    curve = plots.curves_of(still, {'ekf': Trajectory(stamps, poses)})['ekf']
+    assert len(curve['seconds']) == plots.POINTS
+    assert sorted(curve['error_m'])[-2:] == [1.0, 2.0] and np.all(np.diff(curve['seconds']) > 0)
+
+
+def test_the_regions_of_95_percent_are_those_of_the_covariance():
+    turn = rotation(0.4)
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = turn @ np.diag([0.09, 0.01]) @ turn.T
+    x, y = plots._ellipses([Estimate(np.array([1.0, 2.0, 0.0]), covariance)])
+    outline = np.stack([x - 1, y - 2])[:, :-1]
+    squares = np.einsum('in,ij,jn->n', outline, np.linalg.inv(covariance[:2, :2]), outline)
+    assert_allclose(squares, stats.chi2.ppf(0.95, 2), rtol=1e-4)
+    assert np.isnan(x[-1])
+
+
+def test_what_could_not_be_judged_is_a_dash_in_the_tables():
     row = {'mean': 0.12345, 'median': 0.1, 'p95': 0.2, 'rmse': 0.15, 'max': 0.3, 'n': 42}
     scores = {'ekf': row, 'silent': dict.fromkeys(row)}
-    places = np.random.default_rng(0).uniform(0, 10, (50, 2))
-    square = path(range(5, 10), [[0, 0, 0], [4, 0, 0], [4, 4, np.nan], [0, 4, 0], [0, 0, 0]])
-    estimates = {'ekf': square, 'silent': path([], np.zeros((0, 3)))}
-    evaluation.write_report(tmp_path / 'new', TRUTH, estimates, scores, places, places / 5 - 1)
-    pictures = {path.name: cv2.imread(str(path)) for path in (tmp_path / 'new').iterdir()}
-    assert set(pictures) == {'overview.png', 'errors.png'}
-    assert all(min(p.shape[:2]) > 600 and p.std() > 10 for p in pictures.values())
-    picture = pictures['overview.png'].astype(int)
-    paths = picture[: int(0.7 * len(picture)), : picture.shape[1] // 2]  # without the legend
-    rows, columns = np.nonzero(np.abs(paths - (0xB2, 0x72, 0x00)).sum(axis=2) < 12)
-    assert np.ptp(columns) == pytest.approx(np.ptp(rows), rel=0.02) and np.ptp(rows) > 100
     scores['ekf'] |= {'mean': None, 'yaw_deg': {'mean': 1.234, 'median': 1.0, 'p95': 3.0}}
     positions, headings = evaluation.tables(scores).split('\n\n')
     assert positions.splitlines()[2].split('|')[2].strip() == '-'

@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """evaluate --bag writes what the nodes would publish on a drive, with the values it has judged."""
 
+import json
+import re
 from collections import defaultdict
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from page_tables import ROOT
 from picture_readers import DROVE, PictureReader, Recording, load_pictures
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
@@ -23,7 +26,7 @@ from sfa_localization.mapping.settings import GroundConfig
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 IMAGES = 119 - 1  # one is of another size
-LATCHED = {'/tf_static', '/sfa/map', '/ekf/path', '/ekf/state'}
+LATCHED = {'/tf_static', '/sfa/map', '/sfa/map_paths', '/ekf/path', '/ekf/state'}
 
 
 def read(path):
@@ -76,7 +79,7 @@ def test_each_topic_holds_as_many_messages_as_the_nodes_would_publish(replayed):
     assert texts[0] == 'UNINITIALISED: no usable image yet' and 'LOCALISED' in texts
     assert all(a != b for a, b in pairwise(texts))
     assert {topic: len(rows) for topic, rows in messages.items()} == {
-        '/tf_static': 1, '/sfa/map': 1, '/ekf/path': 1,
+        '/tf_static': 1, '/sfa/map': 1, '/sfa/map_paths': 1, '/ekf/path': 1,
         '/panorama/compressed': IMAGES, '/sfa/pose_with_covariance': IMAGES,
         '/sfa/slow_features': IMAGES, '/ground_truth': len(result.truth),
         '/ekf/odometry': len(started) - images, '/ekf/pose': images,
@@ -133,6 +136,23 @@ def test_images_truth_and_map_are_those_of_drive_and_model(replayed):
     assert (grid.info.height, grid.info.width) == cells.driven.shape
     assert [grid.info.origin.position.x, grid.info.origin.position.y] == cells.corner.tolist()
     assert (grid.data == 0).sum() == cells.driven.sum() and (grid.data == -1).any()
+    ((_, paths),) = messages['/sfa/map_paths']
+    (marker,) = paths.markers
+    assert marker.type == marker.LINE_LIST and marker.header.frame_id == 'map'
+    assert [(p.x, p.y) for p in marker.points] == [(0.0, 1.0), (0.5, 1.0), (0.5, 1.0), (0.5, 1.5)]
+    assert [(c.r, c.g) for c in marker.colors] == [(0.0, 1.0), (0.5, 0.5), (0.5, 0.5), (1.0, 0.0)]
+
+
+def test_the_layouts_show_the_truth_and_all_that_a_replay_holds(replayed):
+    """But for what has no place in the view of the map."""
+    layout = json.loads((ROOT / 'config/foxglove_layout.json').read_text('utf-8'))
+    rviz = (ROOT / 'config/localization.rviz').read_text('utf-8')
+    in_rviz = {f'/{topic.strip("/")}' for topic in re.findall(r'Value: (\S+/?\w+)$', rviz, re.M)}
+    shown = set(replayed[1]) - {
+        '/tf_static', '/panorama/compressed', '/sfa/slow_features', '/ekf/state', '/ekf/odometry',
+    }  # fmt: skip
+    assert shown <= set(layout['configById']['3D!map']['topics'])
+    assert shown <= in_rviz
 
 
 def test_a_bag_is_written_whole_or_not_at_all_and_replaces_nothing(

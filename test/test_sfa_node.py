@@ -244,6 +244,25 @@ def test_the_model_changes_in_every_state_and_a_bad_one_is_refused(bench, models
     assert node.health()[2]['model'] == 'b.npz'
 
 
+def test_images_that_come_in_another_order_than_they_were_taken_are_named(bench, models):
+    """One step back, as of a bag in a loop, is not; every second image is."""
+    node = bench.run(SfaNode, model='a.npz')
+    heard = bench.listen(PoseStamped, 'sfa/pose')
+
+    def send(*order):
+        for k in order:
+            count = len(heard)
+            bench.publish('panorama', message(seed=k, stamp_ns=k * 100_000_000))
+            assert until(lambda before=count: len(heard) > before)
+
+    send(*range(10, 30), *range(10, 14))
+    assert node.health()[:2] == (DiagnosticStatus.OK, 'locating')
+    send(*(k + swapped for k in range(30, 40, 2) for swapped in (1, 0)))
+    level, text, _ = node.health()
+    assert level == DiagnosticStatus.WARN
+    assert text.startswith('6 of 34 images come after later ones: ')
+
+
 def test_the_driven_ground_is_published_for_late_viewers(bench, models):
     bench.run(SfaNode, model='b.npz')
     grids, lines = [], []

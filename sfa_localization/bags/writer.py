@@ -183,6 +183,30 @@ class BagWriter:
         message.data = np.where(free, 0, -1).astype(np.int8).ravel()
         self.message(topic, stamp_ns, message, latched=True)
 
+    def lines(
+        self, topic: str, stamp_ns: int, ends: Array, red: Array, width_m: float, frame_id: str
+    ) -> None:
+        """Write lines between every two `ends` (2 L, 2) m as one marker in a latched MarkerArray,
+        from green to `red` (2 L,), 0 to 1.
+        """
+        marker = self._stamped('visualization_msgs/msg/Marker', stamp_ns, frame_id)
+        marker.ns = 'driven'
+        marker.type = marker.LINE_LIST
+        marker.scale.x = width_m
+        marker.pose.orientation.w = 1.0
+        for place, share in zip(ends.tolist(), red.tolist(), strict=True):
+            point = blank(self._types, 'geometry_msgs/msg/Point')
+            point.x, point.y = place
+            color = blank(self._types, 'std_msgs/msg/ColorRGBA')
+            color.r = share
+            color.g = 1.0 - share
+            color.a = 1.0
+            marker.points.append(point)
+            marker.colors.append(color)
+        message = blank(self._types, 'visualization_msgs/msg/MarkerArray')
+        message.markers = [marker]
+        self.message(topic, stamp_ns, message, latched=True)
+
     def text(self, topic: str, stamp_ns: int, text: str) -> None:
         """Write a latched String."""
         message = blank(self._types, 'std_msgs/msg/String')

@@ -106,10 +106,10 @@ def _compare(trained: Trained, live: Live, out: Path, recipe: Recipe) -> Evaluat
 def _write_results(out: Path, result: Evaluation, trained: Trained) -> None:
     """Write errors and figures, with firing maps at the places of the training images."""
     from sfa_localization.data.files import write_json
-    from sfa_localization.reports.evaluation import write_report
+    from sfa_localization.reports.evaluation import write_evaluation_page
 
     write_json(out / 'results.json', result.as_dict())
     places = result.transform.apply(trained.metric.poses[:, :2])
     features = trained.features[trained.metric.images]
-    estimates = {name: result.estimates[name] for name in ('odometry', 'sfa', 'ekf')}
-    write_report(out / 'report', result.truth, estimates, result.scores, places, features)
+    title = 'The demo: what the nodes published, and the truth'
+    write_evaluation_page(out / 'report', title, result, trained.model, (places, features))

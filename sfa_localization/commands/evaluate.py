@@ -8,7 +8,6 @@ import argparse
 import json
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,9 +24,12 @@ if TYPE_CHECKING:
     from sfa_localization.place_model import PlaceModel
 
 logger = logging.getLogger(__name__)
+NOT_ALIGNED = 'none'
+"""In place of training drives: compare in the coordinates of the map."""
 WRITES = """\
-tables on standard output; with --report index.html (one page for a browser) and its figures;
-  with --json the grade (good, weak or bad), a sentence, and the errors; with --tum paths for evo;
+tables on standard output; with --report index.html, a page of plots to click, and the script
+  that draws them without a network; with --json the grade (good, weak or bad), a sentence, the
+  errors, and their curves; with --tum paths for evo;
   with --bag what the nodes would publish, as a bag for RViz and Foxglove"""
 EXAMPLES = """\
   evaluate garden.npz bags/test --align bags/coverage
@@ -74,73 +76,110 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Evaluate; print the errors, and counts of used and rejected inputs."""
-    from sfa_localization import evaluation
-    from sfa_localization.bags.writer import require_new_bag
-    from sfa_localization.commands.replay_bag import write_replay
+    """Evaluate a model on a drive, or print two results of this side by side."""
+    if arguments.model.suffix == arguments.bag.suffix == '.json':
+        _compare(arguments)
+    else:
+        _evaluate(arguments)
+    return 0
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    """Print the errors, and counts of used and rejected inputs; then write files."""
     from sfa_localization.place_model import PlaceModel
     from sfa_localization.reports.evaluation import count_lines, tables, trust_lines
 
-    if arguments.model.suffix == arguments.bag.suffix == '.json':
-        return _compare(arguments)
-    align = arguments.align
-    transform = None
-    if [str(path) for path in align] == ['none']:
-        align = []
-        transform = RigidTransform(0.0, 0.0, 0.0)
-    read = arguments.model, arguments.bag, *align, arguments.config
+    _require_outputs(arguments)
+    model = PlaceModel.load(arguments.model)
+    options.require_same_panorama(arguments.config, model.panorama)
+    with options.noticed() as warnings:
+        result = _judged(arguments, model)
+    print(tables(result.scores), *trust_lines(result.scores), sep='\n')
+    print(*count_lines(result.counts), sep='\n')
+    print(f'aligned on {result.aligned_on}', *result.corrections, sep='\n')
+    _write_files(arguments, model, result, warnings)
+
+
+def _require_outputs(arguments: argparse.Namespace) -> None:
+    """Raise LocalizationError for outputs that cannot be written, before the work."""
+    from sfa_localization.bags.writer import require_new_bag
+
     if arguments.json:
+        read = arguments.model, arguments.bag, *arguments.align, arguments.config
         options.require_output(arguments.json, read, '.json')
     options.require_report(arguments.report, arguments.json)
     if arguments.replay:
         require_new_bag(arguments.replay)
-    model = PlaceModel.load(arguments.model)
-    options.require_same_panorama(arguments.config, model.panorama)
-    with options.noticed() as warnings:
-        if transform is not None and not model.quality.get('points'):
+
+
+def _judged(arguments: argparse.Namespace, model: PlaceModel) -> Evaluation:
+    """Evaluate a model on the drive, in the coordinates that --align names."""
+    from sfa_localization.evaluation import evaluate
+
+    align = arguments.align
+    transform = None
+    if [str(path) for path in align] == [NOT_ALIGNED]:
+        align = []
+        transform = RigidTransform(0.0, 0.0, 0.0)
+        if not model.quality.get('points'):
             logger.warning(
                 '%s: its map has no measured points, so that its coordinates are its own: train '
                 'with --points or --points-topic, or evaluate with --align TRAIN_BAG',
                 arguments.model,
             )
-        result = evaluation.evaluate(
-            model,
-            arguments.bag,
-            align_bags=align,
-            recipe=options.recipe(arguments),
-            config=options.settings(FilterConfig, arguments),
-            watch=options.settings(WatchConfig, arguments),
-            progress=True,
-            smooth=arguments.smooth,
-            transform=transform,
-        )
-    print(tables(result.scores), *trust_lines(result.scores), sep='\n')
-    print(*count_lines(result.counts), sep='\n')
-    print(f'aligned on {result.aligned_on}', *result.corrections, sep='\n')
-    _write_files(arguments, model, result, warnings)
-    if arguments.replay:
-        write_replay(arguments.replay, result, model.ground)
-        print(f'{arguments.replay}: written')
-    return 0
+    return evaluate(
+        model,
+        arguments.bag,
+        align_bags=align,
+        recipe=options.recipe(arguments),
+        config=options.settings(FilterConfig, arguments),
+        watch=options.settings(WatchConfig, arguments),
+        progress=True,
+        smooth=arguments.smooth,
+        transform=transform,
+    )
 
 
 def _write_files(
     arguments: argparse.Namespace, model: PlaceModel, result: Evaluation, warnings: Sequence[str]
 ) -> None:
-    """Write what was asked for, the report last."""
+    """Write what was asked for."""
+    from sfa_localization.commands.replay_bag import write_replay
     from sfa_localization.filtering import write_trajectory
     from sfa_localization.reports.evaluation import judgment
+    from sfa_localization.reports.plots import curves_of
 
     if arguments.json:
         grade, sentence = judgment(result.scores, result.counts)
-        write_json(arguments.json, {**result.as_dict(), 'grade': grade, 'sentence': sentence})
+        verdict = {'grade': grade, 'sentence': sentence}
+        curves = curves_of(result.truth, result.estimates)
+        write_json(arguments.json, {**result.as_dict(), **verdict, 'curves': curves})
     for name, path in {'truth': result.truth, **result.estimates}.items() if arguments.tum else ():
         write_trajectory(path, arguments.tum / f'{name}.tum')
     if arguments.report:
         _write_report(arguments, model, result, warnings)
+    if arguments.replay:
+        write_replay(arguments.replay, result, model.ground)
+        print(f'{arguments.replay}: written')
 
 
-def _compare(arguments: argparse.Namespace) -> int:
+def _write_report(
+    arguments: argparse.Namespace, model: PlaceModel, result: Evaluation, warnings: Sequence[str]
+) -> None:
+    """Write figures and the page."""
+    from sfa_localization.reports.evaluation import write_evaluation_page
+    from sfa_localization.reports.page import PAGE, begin_page
+
+    folder = arguments.report
+    begin_page(folder)
+    title = f'{arguments.model.name} on {arguments.bag.name}'
+    features = result.estimates['sfa'].poses[:, :2], result.features
+    notes = f'The map is aligned on {result.aligned_on}.', *result.corrections, *warnings
+    write_evaluation_page(folder, title, result, model, features, notes)
+    print(f'{folder / PAGE}: written')
+
+
+def _compare(arguments: argparse.Namespace) -> None:
     """Print two results side by side. Raises DataError."""
     from sfa_localization.reports.comparison import comparison_text, write_comparison_page
     from sfa_localization.reports.page import PAGE, begin_page
@@ -153,7 +192,6 @@ def _compare(arguments: argparse.Namespace) -> int:
         begin_page(folder)
         write_comparison_page(folder, [file.name for file in files], results)
         print(f'{folder / PAGE}: written')
-    return 0
 
 
 def _results(file: Path) -> dict[str, Any]:
@@ -168,28 +206,3 @@ def _results(file: Path) -> dict[str, Any]:
     if not means or 'sentence' not in results or results.get('grade') not in STATES:
         raise DataError(f'{file}: holds no results: write them by evaluate --json')
     return results
-
-
-def _write_report(
-    arguments: argparse.Namespace, model: PlaceModel, result: Evaluation, warnings: Sequence[str]
-) -> None:
-    """Write figures and the page; the worst images are read from the bag again."""
-    from sfa_localization.bags.drives import images_at
-    from sfa_localization.reports.evaluation import worst_of, write_evaluation_page, write_report
-    from sfa_localization.reports.page import PAGE, begin_page
-
-    folder = arguments.report
-    drive = (result.truth, result.estimates, result.scores)
-    begin_page(folder)
-    write_report(folder, *drive, result.estimates['sfa'].poses[:, :2], result.features)
-    late_ns = round(result.counts.get('camera_delay_s', 0.0) * 1e9)
-    worst = worst_of(result.truth, result.estimates['sfa'])
-    stamps = {image: stamp + late_ns for image, stamp in worst.items()}
-    recipe = options.recipe(arguments)
-    recipe = replace(recipe, panorama=model.panorama, surround=model.surround)
-    read = images_at(arguments.bag, stamps.values(), recipe)
-    samples = {image: read[stamp] for image, stamp in stamps.items() if stamp in read}
-    title = f'{arguments.model.name} on {arguments.bag.name}'
-    notes = f'The map is aligned on {result.aligned_on}.', *result.corrections, *warnings
-    write_evaluation_page(folder, title, *drive, result.counts, samples, notes)
-    print(f'{folder / PAGE}: written')

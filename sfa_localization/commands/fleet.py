@@ -53,6 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Work on all gardens that have changed; print those that are not good."""
     from sfa_localization.reports.fleet import write_fleet_page
+    from sfa_localization.reports.plots import write_script
 
     if arguments.workers < 1:
         raise ConfigError('--workers: give 1 or more')
@@ -63,6 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     if file:
         options.require_output(file, [], '.json')
     gardens = _gardens(arguments.gardens, output)
+    write_script(output)
     changed = [garden for garden in gardens if not garden.is_up_to_date()]
     try:
         with _cluster(address) if address else _processes(arguments.workers) as place:

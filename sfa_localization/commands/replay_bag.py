@@ -13,7 +13,7 @@ from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.geometry import invert
 from sfa_localization.data.run import BATCH
 from sfa_localization.evaluation import Evaluation
-from sfa_localization.mapping.driven_ground import DrivenGround
+from sfa_localization.mapping.driven_ground import LINE_M, DrivenGround
 from sfa_localization.mapping.settings import GroundConfig
 
 _MAP = 'map'
@@ -33,6 +33,8 @@ def write_replay(path: Path, result: Evaluation, ground: DrivenGround) -> None:
         bag.static_transform(start_ns, invert(of_map), (_MAP, _TRUTH))
         cells = ground.cells(GroundConfig())
         bag.grid('/sfa/map', start_ns, cells.driven, cells.corner, cells.size_m, _MAP)
+        ends = ground.places[ground.lines.ravel()]
+        bag.lines('/sfa/map_paths', start_ns, ends, ground.red, LINE_M, _MAP)
         states = [step.state for step in result.steps if step.state and step.image is None]
         if states:
             stamps_ns = np.array([start_ns, *(state.stamp_ns for state in states)])

@@ -9,6 +9,7 @@ and seems to move them with the sun; their colors stay.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -79,6 +80,12 @@ def _small(image: NDArray[Any], rows: int, columns: int) -> Texture:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
+def _stretched(image: Texture, rows: int) -> Texture:
+    """An image (H, W) of so many rows."""
+    size = image.shape[1], rows
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), np.float32)
+
+
 def normalized(image: Texture) -> Texture:
     """An image of zero mean and unit norm."""
     centered = image - image.mean()
@@ -95,6 +102,21 @@ def channels(rows: int) -> tuple[slice, ...]:
     few = min(rows // 3, _COLOR_ROWS)
     light = rows - 2 * few
     return slice(0, light), slice(light, light + few), slice(light + few, rows)
+
+
+def picture(texture: Texture, parts: Sequence[slice]) -> Image:
+    """A texture (rows, columns) with these `channels` as an image (rows, columns, 3) uint8 BGR, in
+    which three standard deviations of brightness or color are black and white.
+    """
+    light, red, blue = (texture[part] for part in parts)
+    if len(red):
+        red, blue = (_stretched(color, len(light)) for color in (red, blue))
+    else:
+        red = blue = np.zeros_like(light)
+    rest = light - blue / 3
+    bgr = np.dstack([light + 2 / 3 * blue, rest - red / 2, rest + red / 2])
+    scaled = 128 + bgr * (127 / max(3 * float(bgr.std()), 1e-6))
+    return np.asarray(np.clip(scaled, 0, 255), np.uint8)
 
 
 def quantized(textures: Texture) -> NDArray[np.int8]:

@@ -18,6 +18,10 @@ from sfa_localization.mapping.settings import GroundConfig
 
 # Images farther from the one before are drawn apart: the drive between them is not in the map.
 _JOINED_M = 1.0
+RED_M = 0.3
+"""Expected error from which paths are drawn red."""
+LINE_M = 0.05
+"""Width of the drawn paths."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +72,13 @@ class DrivenGround:
         """Rows (L, 2) of the places at the ends of each stretch that was driven."""
         ends = np.flatnonzero(self.joined)
         return np.column_stack([ends - 1, ends])
+
+    @property
+    def red(self) -> Array:
+        """How red the ends (2 L,) of the lines are drawn: 0, green, where one image hardly errs, to
+        1 from RED_M on.
+        """
+        return np.minimum(self.expected_m[self.lines.ravel()] / RED_M, 1.0)
 
     def cells(self, config: GroundConfig) -> Cells:
         """The cells that a robot of some width covered."""

@@ -34,15 +34,12 @@ from sfa_localization.data.geometry import Array, Mask
 from sfa_localization.data.messages import NANOSECONDS, read_stamp, require_sane
 from sfa_localization.data.rig import Rig
 from sfa_localization.data.run import Image
-from sfa_localization.mapping.driven_ground import Cells, DrivenGround
+from sfa_localization.mapping.driven_ground import LINE_M, Cells, DrivenGround
 
 _CORRELATION = 'error_correlation'
 _OCCUPIED = 100
 _TEXT_M = 0.4
 _TEXT_UP_M = 1.0
-_RED_M = 0.3
-_LINE_M = 0.05
-"""The expected error that is drawn red, and the width of the lines."""
 
 
 def to_stamp(stamp_ns: int) -> Time:
@@ -199,7 +196,7 @@ def to_hints(drives: Sequence[Array], text: str, stamp_ns: int, frame: str) -> M
     for number, places in enumerate(drives):
         line = Marker(header=_header(stamp_ns, frame), ns='drive', type=Marker.LINE_STRIP)
         line.id = number
-        line.scale.x = _LINE_M
+        line.scale.x = LINE_M
         line.pose.orientation.w = 1.0
         line.color = ColorRGBA(g=1.0, a=1.0)
         line.points = [geometry.Point(x=x, y=y) for x, y in places[:, :2].tolist()]
@@ -214,14 +211,13 @@ def to_hints(drives: Sequence[Array], text: str, stamp_ns: int, frame: str) -> M
 
 
 def to_lines(ground: DrivenGround, stamp_ns: int, frame: str) -> MarkerArray:
-    """The paths of the training as lines: green where one image hardly errs, red from _RED_M on."""
+    """The paths of the training as lines, by the error of one image from green to red."""
     marker = Marker(header=_header(stamp_ns, frame), ns='driven', type=Marker.LINE_LIST)
-    marker.scale.x = _LINE_M
+    marker.scale.x = LINE_M
     marker.pose.orientation.w = 1.0
     ends = ground.lines.ravel()
     marker.points = [geometry.Point(x=x, y=y) for x, y in ground.places[ends].tolist()]
-    red = np.minimum(ground.expected_m[ends] / _RED_M, 1.0)
-    marker.colors = [ColorRGBA(r=share, g=1.0 - share, a=1.0) for share in red.tolist()]
+    marker.colors = [ColorRGBA(r=share, g=1.0 - share, a=1.0) for share in ground.red.tolist()]
     return MarkerArray(markers=[marker])
 
 

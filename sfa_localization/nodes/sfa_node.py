@@ -49,6 +49,9 @@ from sfa_localization.place_model import PlaceModel
 
 _FEATURE_FRAME = 'slow_feature_space'
 _TURNED_FRAME = 'first_image'
+_MOSTLY = 0.9
+"""Share of the images that come in the order of their stamps where the driver is right: a bag that
+is played in a loop steps back once in hundreds."""
 
 
 class SfaNode(LocalizationNode):
@@ -66,6 +69,8 @@ class SfaNode(LocalizationNode):
         self._observer = Observer(self._load(self._config.model), self.settings(WatchConfig))
         self._last: Observation | None = None
         self._turned_ns = 0
+        self._located = 0
+        self._in_order = 0
         self._features = self.publisher(Float64MultiArray, 'sfa/slow_features')
         self._feature_pose = self.publisher(PoseStamped, 'sfa/slow_feature_pose')
         self._pose = self.publisher(PoseStamped, 'sfa/pose')
@@ -176,6 +181,13 @@ class SfaNode(LocalizationNode):
             self._told_troubles = problem
             self._troubles.publish(String(data=problem))
 
+    def _order_problem(self) -> str:
+        """That the camera's driver sends images in another order than it took them; '' if not."""
+        if self._in_order + 1 >= _MOSTLY * self._located:
+            return ''
+        late = f'{self._located - self._in_order} of {self._located} images come after later ones'
+        return f'{late}: the driver must send images in the order in which it takes them'
+
     def _locate(self, stamp_ns: int, image: Image, frame: str) -> None:
         assert self._observer is not None
         self._camera_frame = frame
@@ -186,6 +198,8 @@ class SfaNode(LocalizationNode):
         of_panoramas = model.lens is not None and model.lens.camera_model == 'panorama'
         if self._declared is None and of_panoramas:  # omnicam_node would have mounted it
             image = _unwrapper(model.lens, model.panorama)(image)
+        self._located += 1
+        self._in_order += self._last is None or stamp_ns >= self._last.stamp_ns
         self._last = observation = self._observer.observe(stamp_ns, image)
         self._publish(observation)
         if observation.problem:
@@ -229,7 +243,7 @@ class SfaNode(LocalizationNode):
             return ERROR, 'no image has been usable', values
         if self._last is not None and self._last.problem:
             return WARN if self._observer.watch.repeats else ERROR, self._last.problem, values
-        if problem := self._camera_problem():
+        if problem := self._camera_problem() or self._order_problem():
             self.get_logger().warning(problem, once=True)
             return WARN, problem, values
         if explained < EXPLAINED_WARNING:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.reports import page
-from sfa_localization.reports.figures import in_meters, save
+from sfa_localization.reports.figures import SQUARE, in_meters, save
 
 
 def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
@@ -21,7 +21,7 @@ def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
 
     Raises LocalizationError.
     """
-    figure = Figure((6.5, 6), layout='constrained')
+    figure = Figure(figsize=SQUARE, layout='constrained')
     axes = figure.add_subplot()
     axes.plot(poses[:, 0], poses[:, 1], color='0.8', linewidth=1, zorder=1)
     order = np.linspace(0, 100, len(places))

@@ -4,17 +4,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sfa_localization.reports import page
-from sfa_localization.reports.evaluation import LABELS, markdown, number
+from sfa_localization.reports.evaluation import LABELS, LOOKS, markdown, number
+from sfa_localization.reports.plots import Line, linked_plots
 
 Results = Mapping[str, Any]
 """What `evaluate --json` writes."""
 MEASURES = ('mean', 'p95', 'max')
 COLUMNS = tuple(f'{name}{which}' for name in MEASURES for which in ('', ', second'))
+COLORS = {'sfa': '#56B4E9', 'ekf': '#0072B2'}, {'sfa': '#F0C05A', 'ekf': '#D55E00'}
+"""Of the first result and of the second: blue and orange."""
 HEAD = ('position error (m)', *COLUMNS)
 
 
@@ -42,4 +45,24 @@ def write_comparison_page(folder: Path, names: Sequence[str], results: Sequence[
     ]
     table = page.table(HEAD, comparison_rows(*results))
     title = f'{names[0]}, and second {names[1]}'
-    page.write_page(folder, title, *verdicts, page.section('How far off?', table))
+    page.write_page(
+        folder,
+        title,
+        *verdicts,
+        page.section('How far off?', table),
+        page.section('Where?', *_plots(folder, names, results)),
+    )
+
+
+def _plots(folder: Path, names: Sequence[str], results: Sequence[Results]) -> Iterator[str]:
+    """The paths and errors of the filter and of single images, if the results hold them."""
+    curves = [result.get('curves', {}) for result in results]
+    lines = [
+        Line(f'{name}: {LABELS[estimate]}', of_run[estimate], color, 'solid', LOOKS[estimate][2])
+        for name, of_run, colors in zip(names, curves, COLORS, strict=True)
+        for estimate, color in colors.items()
+        if estimate in of_run
+    ]
+    if lines and 'truth' in curves[0]:
+        yield '<p>Click a point: both plots mark that moment.</p>'
+        yield linked_plots(folder, curves[0]['truth'], lines)

@@ -11,25 +11,24 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import PathCollection
-from matplotlib.figure import Figure, SubFigure
 
-from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.data.run import Image, Stamps, Trajectory
+from sfa_localization.data.geometry import Array
 from sfa_localization.reports import page
 from sfa_localization.reports.figures import (
-    WorstImage,
-    in_meters,
-    save,
+    FIRING_CAPTION,
+    firing_maps_figure,
     worst_images,
-    write_worst_images,
 )
+from sfa_localization.reports.moments import Moment, moments_of
+from sfa_localization.reports.plots import Line, curves_of, errors_of, linked_plots
 
-Estimates = Mapping[str, Trajectory]
+if TYPE_CHECKING:
+    from sfa_localization.evaluation import Evaluation
+    from sfa_localization.place_model import PlaceModel
+
 Scores = Mapping[str, Mapping[str, Any]]
 
 COLUMNS = ('mean', 'median', 'p95', 'rmse', 'max', 'n')
@@ -40,48 +39,18 @@ LABELS = {
     'ekf': 'EKF: SFA + odometry',
     'smoothed': 'EKF, smoothed',
 }
-# Lines above dots above the truth; dots for estimates from single images.
-STYLES: dict[str, dict[str, Any]] = {
-    'odometry': {'color': '#E69F00', 'linestyle': '--', 'linewidth': 1.4, 'zorder': 3},
-    'sfa': {'color': '#56B4E9', 'linestyle': '', 'marker': 'o', 'markersize': 2.6, 'zorder': 2},
-    'ekf': {'color': '#0072B2', 'linestyle': '-', 'linewidth': 1.7, 'zorder': 4},
-    'smoothed': {'color': '#D55E00', 'linestyle': '-', 'linewidth': 1.2, 'zorder': 5},
+LOOKS = {
+    'odometry': ('#E69F00', 'dash', 'lines'),
+    'sfa': ('#56B4E9', 'solid', 'markers'),
+    'ekf': ('#0072B2', 'solid', 'lines'),
+    'smoothed': ('#CC79A7', 'solid', 'lines'),
 }
-OTHER: dict[str, Any] = {'color': '#CC79A7', 'linestyle': '-', 'linewidth': 1.2}
-TRUTH: dict[str, Any] = {'color': '0.72', 'linewidth': 5.0, 'solid_capstyle': 'round', 'zorder': 1}
-FIRING_MAPS = 8
-"""Firing maps in a figure, those of the slowest features."""
-FEATURE_LIMIT = 2.0
-"""Value at which the colors saturate; slow features have unit variance."""
-MARGIN_M = 0.5
-"""Margin around the paths (m)."""
+"""Color, dash and mode of the curves."""
 TRUSTED_SHARE = 0.8
 """Share of true positions in the filter's 95 % regions below which its covariances are too small;
 errors of neighboring images are correlated, so the share varies."""
 _UNORDERED = 'stamp jumps', 'stamp out of order'
 _WEAK = 2.0  # times the mean error, from which a place counts as weak
-
-
-class Errors(NamedTuple):
-    """Errors of the estimates that the truth covers: position (M,) m, and heading (M,) degrees, NaN
-    without a heading; with stamps (M,), seconds (M,) since the truth's start, places (M, 2) m.
-    """
-
-    stamps_ns: Stamps
-    seconds: Array
-    places: Array
-    position_m: Array
-    heading_deg: Array
-
-
-def errors_of(truth: Trajectory, estimate: Trajectory) -> Errors:
-    """The errors of an estimate."""
-    mask = truth.covers(estimate.stamps_ns)
-    stamps = estimate.stamps_ns[mask]
-    true = truth.at(stamps)
-    x, y, yaw = (estimate.poses[mask] - true).T
-    seconds = (stamps - truth.stamps_ns[0]) * 1e-9
-    return Errors(stamps, seconds, true[:, :2], np.hypot(x, y), np.degrees(wrap_angle(yaw)))
 
 
 def tables(scores: Scores) -> str:
@@ -145,167 +114,39 @@ def trust_lines(scores: Scores) -> list[str]:
     return lines
 
 
-def write_report(
-    folder: Path,
-    truth: Trajectory,
-    estimates: Estimates,
-    scores: Scores,
-    positions: Array,
-    features: Array,
-) -> None:
-    """Write overview.png, with paths, errors and firing maps, and errors.png into `folder`.
-
-    Estimates are in the truth's frame; firing maps show `features` (N, K) at `positions` (N, 2) m.
-    Raises LocalizationError.
-    """
-    figure = Figure(figsize=(13.0, 6.2), layout='constrained')
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.2)).flat
-    _draw_paths(left.add_subplot(), truth, estimates, scores)
-    upper, lower = right.subfigures(2, 1, squeeze=False, height_ratios=(0.8, 1.0)).flat
-    row = upper.subplots(1, 4, sharey=True, squeeze=False)[0]
-    _draw_firing_maps(upper, row, positions, features)
-    _draw_position_errors(lower.add_subplot(), truth, estimates)
-    save(figure, folder / 'overview.png')
-    errors_figure(folder / 'errors.png', truth, estimates)
-
-
-def errors_figure(path: Path, truth: Trajectory, estimates: Estimates) -> None:
-    """Draw position errors (m) and heading errors (degrees) over time (s)."""
-    figure = Figure(figsize=(9.6, 6.0), layout='constrained')
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    _draw_position_errors(upper, truth, estimates)
-    for name, estimate in estimates.items():
-        errors = errors_of(truth, estimate)
-        lower.plot(errors.seconds, errors.heading_deg, **STYLES.get(name, OTHER))
-    lower.axhline(0.0, color='0.4', linewidth=0.8)
-    lower.set(xlabel='time (s)', ylabel='heading error (°)', xlim=(0, None))
-    lower.grid(alpha=0.3)
-    upper.set_xlabel('')
-    save(figure, path)
-
-
-def firing_maps_figure(path: Path, positions: Array, features: Array) -> None:
-    """Draw the spatial firing maps of the first 8 slow features: their value at every place.
-
-    `positions` (N, 2) of the images in meters; `features` (N, K).
-    """
-    figure = Figure(figsize=(12.0, 6.2), layout='compressed')
-    grid = figure.subplots(2, FIRING_MAPS // 2, sharex=True, sharey=True, squeeze=False)
-    _draw_firing_maps(figure, list(grid.flat), positions, features)
-    save(figure, path)
-
-
-def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Scores) -> None:
-    axes.plot(truth.poses[:, 0], truth.poses[:, 1], label='ground truth', **TRUTH)
-    axes.plot(*truth.poses[0, :2], marker='s', color='black', markersize=7, zorder=5, ls='')
-    x, y = truth.poses[0, :2]
-    axes.annotate('start', (x, y), xytext=(7, 7), textcoords='offset points')
-    for name, estimate in estimates.items():
-        mean = f': {number(scores[name]["mean"], "mean")} m'
-        points = estimate.poses[truth.covers(estimate.stamps_ns)]
-        axes.plot(points[:, 0], points[:, 1], label=_label(name) + mean, **STYLES.get(name, OTHER))
-    _frame_view(axes, np.concatenate([truth.poses, *map(_bulk, estimates.values())])[:, :2])
-    axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.09), ncols=2, frameon=False)
-    axes.set_title('Estimated and true paths (mean error)')
-
-
-def _draw_position_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -> None:
-    for name, estimate in estimates.items():
-        errors = errors_of(truth, estimate)
-        style = STYLES.get(name, OTHER)
-        axes.plot(errors.seconds, errors.position_m, label=_label(name), **style)
-    axes.set(xlabel='time (s)', ylabel='position error (m)', xlim=(0, None), ylim=(0, None))
-    axes.grid(alpha=0.3)
-    if estimates:
-        above: dict[str, Any] = {'loc': 'lower left', 'bbox_to_anchor': (0.0, 1.0)}
-        axes.legend(**above, frameon=False, ncols=len(estimates), fontsize='small')
-
-
-def _draw_firing_maps(
-    figure: Figure | SubFigure, panels: Sequence[Axes], positions: Array, features: Array
-) -> None:
-    # Dots of a panel touch one another: their area in square points.
-    inches = figure.bbox.width * figure.bbox.height / figure.dpi**2
-    size = np.clip(0.6 * inches * 72**2 / len(panels) / max(len(positions), 1), 2.0, 40.0)
-    dots: PathCollection | None = None
-    for index, axes in enumerate(panels):
-        if index >= features.shape[1]:
-            axes.set_axis_off()
-            continue
-        dots = axes.scatter(
-            positions[:, 0], positions[:, 1], c=features[:, index], s=size, linewidths=0,
-            cmap='RdBu_r', vmin=-FEATURE_LIMIT, vmax=FEATURE_LIMIT,
-        )  # fmt: skip
-        _frame_view(axes, positions)
-        axes.set_title(f'slow feature {index + 1}', fontsize='medium')
-        axes.label_outer()
-    if dots is not None:
-        bar = figure.colorbar(dots, ax=list(panels), shrink=0.7, aspect=14, extend='both')
-        bar.set_label('standard deviations', fontsize='small')
-
-
-def _bulk(estimate: Trajectory) -> Array:
-    """Corners (2, 3) of an estimate without outliers, between its percentiles 1 and 99."""
-    poses = estimate.poses[np.isfinite(estimate.poses).all(1)]
-    if not len(poses):
-        return poses
-    low, high = np.percentile(poses[:, :2], (1.0, 99.0), axis=0)
-    return np.pad(np.stack([low, high]), ((0, 0), (0, 1)))
-
-
-def _frame_view(axes: Axes, points: Array) -> None:
-    """Equal axes in meters, limited to the points and a margin."""
-    if len(points):
-        low = points.min(axis=0) - MARGIN_M
-        high = points.max(axis=0) + MARGIN_M
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axes.set_aspect('equal')
-    axes.set(xlabel='x (m)', ylabel='y (m)')
-    axes.grid(alpha=0.3)
-    axes.set_axisbelow(True)
-
-
-def worst_of(truth: Trajectory, estimate: Trajectory) -> dict[WorstImage, int]:
-    """The images whose positions are farthest from the truth, and their stamps."""
-    errors = errors_of(truth, estimate)
-    worst = worst_images(errors.places, errors.position_m)
-    return {image: int(errors.stamps_ns[image.row]) for image in worst}
-
-
 def write_evaluation_page(
     folder: Path,
     title: str,
-    truth: Trajectory,
-    estimates: Estimates,
-    scores: Scores,
-    counts: Mapping[str, Any],
-    samples: Mapping[WorstImage, Image],
+    result: Evaluation,
+    model: PlaceModel,
+    features: tuple[Array, Array],
     notes: Sequence[str] = (),
 ) -> None:
-    """Write `folder`/index.html with the figures of `write_report` and an error map.
+    """Write `folder`/index.html with plots to click, and firing maps of features: places (N, 2) m
+    in the frame of the truth, and values (N, K). `notes` tell what the truth is.
 
-    `counts` are those of Evaluation, `samples` the worst images, `notes` tell what the truth is.
     Raises LocalizationError.
     """
-    error_map_figure(folder / 'error_map.png', truth, estimates['ekf'])
-    if samples:
-        write_worst_images(folder / 'worst_images.png', samples)
+    firing_maps_figure(folder / 'firing_maps.png', *features)
+    scores = result.scores
     headings = _heading_rows(scores)
+    moments = moments_of(result, model)
+    curves = curves_of(result.truth, result.estimates)
+    trained = result.transform.apply(model.keyframes.poses[:, :2])
+    lines = [Line(_label(name), curves[name], *LOOKS[name]) for name in result.estimates]
     page.write_page(
         folder,
         title,
-        page.verdict(*judgment(scores, counts)),
+        page.verdict(*judgment(scores, result.counts)),
         page.section('How far off?', page.table(*_position_rows(scores)),
-                     page.table(*headings) if headings[1] else '', page.items(notes),
-                     page.figure(folder / 'overview.png', 'Estimated and true paths, slow features '
-                                 'where the images seem to be taken, and errors')),
-        page.section('Where is it weak?', page.items([*_weak_lines(truth, estimates['ekf'])]),
-                     page.figure(folder / 'error_map.png', 'Error of the filter along the path')),
-        page.section('May I trust it?', page.items(trust_lines(scores)),
-                     page.figure(folder / 'errors.png', 'Errors over time')),
-        page.section('What was rejected?', page.items(count_lines(counts))),
-        page.section('Worst images', page.figure(folder / 'worst_images.png', 'Single images with '
-                     'the largest errors, and where they were taken')) if samples else '',
+                     page.table(*headings) if headings[1] else '', page.items(notes)),
+        page.section('Where, and what did it see?', '<p>Click a point, or move the slider: all '
+                     'plots mark that moment, and its image appears.</p>',
+                     linked_plots(folder, curves['truth'], lines, moments, trained)),
+        page.section('Where is it weak?', *_weak_parts(result, moments)),
+        page.section('May I trust it?', page.items(trust_lines(scores))),
+        page.section('What was rejected?', page.items(count_lines(result.counts))),
+        page.section('Slow features', page.figure(folder / 'firing_maps.png', FIRING_CAPTION)),
     )  # fmt: skip
 
 
@@ -344,32 +185,30 @@ def _trust(row: Mapping[str, Any]) -> tuple[str, bool]:
     return f'but the covariances are too small: {errors}', False
 
 
-def error_map_figure(path: Path, truth: Trajectory, estimate: Trajectory) -> None:
-    """Draw the true path colored by the position error (m) of an estimate."""
-    figure = Figure(figsize=(7.0, 6.0), layout='constrained')
-    axes = figure.add_subplot()
-    errors = errors_of(truth, estimate)
-    top = max(float(np.percentile(errors.position_m, 98)), 0.05) if len(errors.places) else 1.0
-    x, y = errors.places.T
-    dots = axes.scatter(x, y, c=errors.position_m, s=14, cmap='viridis', vmin=0.0, vmax=top)
-    figure.colorbar(dots, label='position error (m)', shrink=0.85, extend='max')
-    in_meters(axes, 'Position error of the filter')
-    save(figure, path)
-
-
-def _weak_lines(truth: Trajectory, estimate: Trajectory) -> Iterator[str]:
-    """Where the errors of the filter are largest, and the remedy."""
-    _, _, places, errors, _ = errors_of(truth, estimate)
-    if not len(errors):
+def _weak_parts(result: Evaluation, moments: Sequence[Moment]) -> Iterator[str]:
+    """Where the errors of the filter are largest, the remedy, and buttons for the worst images."""
+    errors = errors_of(result.truth, result.estimates['ekf'])
+    if not len(errors.seconds):
         return
-    worst = [k for k in worst_images(places, errors) if k.error_m > _WEAK * errors.mean()]
-    for k in worst[:3]:
-        yield f'near x {k.x_m:.1f} m, y {k.y_m:.1f} m: {k.error_m:.2f} m'
-    if worst:
-        yield 'These coordinates are those of the ground truth.'
-        yield 'Drive there in a further training drive, in two directions.'
-    else:
-        yield f'Nowhere is the error more than {_WEAK:g} times its mean.'
+    mean = errors.position_m.mean()
+    weak = [k for k in worst_images(errors.places, errors.position_m) if k.error_m > _WEAK * mean]
+    at = [f'near x {k.x_m:.1f} m, y {k.y_m:.1f} m: {k.error_m:.2f} m' for k in weak[:3]]
+    remedy = (
+        'These coordinates are those of the ground truth.',
+        'Drive there in a further training drive, in two directions.',
+    )
+    even = f'Nowhere is the error more than {_WEAK:g} times its mean.'
+    yield page.items([*at, *remedy] if at else [even])
+    judged = [k for k in moments if not k.problem and math.isfinite(k.error_m(k.single))]
+    places = np.array([moment.truth[:2] for moment in judged]).reshape(-1, 2)
+    worst = worst_images(places, np.array([k.error_m(k.single) for k in judged]))
+    buttons = [
+        f'<button class="at" data-seconds="{judged[k.row].seconds:.3f}">x {k.x_m:.1f} m, '
+        f'y {k.y_m:.1f} m: error {k.error_m:.2f} m</button>'
+        for k in worst
+    ]
+    if buttons:
+        yield f'<p>Images whose own places are farthest off: {" ".join(buttons)}</p>'
 
 
 def count_lines(counts: Mapping[str, Any]) -> list[str]:
@@ -382,7 +221,7 @@ def count_lines(counts: Mapping[str, Any]) -> list[str]:
         lines.append(f'{stream}: {counts[stream]["used"]} used{reasons}')
     usual = 'odometry: used', 'measurement: accepted', 'measurement: started'
     lines += _image_lines(counts)
-    rejected = sorted((why, n) for why, n in counts['fusion'].items() if why not in usual)
+    rejected = sorted((why, n) for why, n in counts.get('fusion', {}).items() if why not in usual)
     lines += [f'filter: {n} times {reason}' for reason, n in rejected]
     states = ', '.join(f'{name} {seconds:.1f} s' for name, seconds in counts['states_s'].items())
     lines.append(f'state: {states}')

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from sfa_localization.data.files import atomic_write, write_bytes
@@ -17,6 +18,15 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.rejections import encodable
 from sfa_localization.data.run import Image
 
+FIRING_MAPS = 8
+"""Firing maps in a figure, those of the slowest features."""
+FEATURE_LIMIT = 2.0
+"""Value at which the colors saturate; slow features have unit variance."""
+FIRING_CAPTION = 'Slow features at the places of the images: good ones change smoothly'
+MARGIN_M = 0.5
+"""Margin around places in firing maps (m)."""
+SQUARE = 5.4, 4.6
+"""Inches of a map: its text of 10 points is 10 pixels high on a phone of 390 pixels."""
 DOTS_PER_INCH = 130
 """Resolution of the figures: sharp on a screen, in small files."""
 
@@ -96,3 +106,44 @@ def write_contact_sheet(
         axis.imshow(sample[..., ::-1], interpolation='lanczos')
         axis.set_title(caption, fontsize=9)
     save(figure, path)
+
+
+def firing_maps_figure(path: Path, positions: Array, features: Array) -> None:
+    """Draw the spatial firing maps of the first 8 slow features: their value at every place.
+
+    `positions` (N, 2) of the images in meters; `features` (N, K).
+    """
+    figure = Figure(figsize=(12.0, 6.2), layout='compressed')
+    grid = figure.subplots(2, FIRING_MAPS // 2, sharex=True, sharey=True, squeeze=False)
+    panels = list(grid.flat)
+    # Dots of a panel touch one another: their area in square points.
+    inches = figure.bbox.width * figure.bbox.height / figure.dpi**2
+    size = np.clip(0.6 * inches * 72**2 / len(panels) / max(len(positions), 1), 2.0, 40.0)
+    dots: PathCollection | None = None
+    for index, axes in enumerate(panels):
+        if index >= features.shape[1]:
+            axes.set_axis_off()
+            continue
+        dots = axes.scatter(
+            positions[:, 0], positions[:, 1], c=features[:, index], s=size, linewidths=0,
+            cmap='RdBu_r', vmin=-FEATURE_LIMIT, vmax=FEATURE_LIMIT,
+        )  # fmt: skip
+        _frame_view(axes, positions)
+        axes.set_title(f'slow feature {index + 1}', fontsize='medium')
+        axes.label_outer()
+    if dots is not None:
+        bar = figure.colorbar(dots, ax=panels, shrink=0.7, aspect=14, extend='both')
+        bar.set_label('standard deviations', fontsize='small')
+    save(figure, path)
+
+
+def _frame_view(axes: Axes, points: Array) -> None:
+    """Equal axes in meters, limited to the points and a margin."""
+    if len(points):
+        low = points.min(axis=0) - MARGIN_M
+        high = points.max(axis=0) + MARGIN_M
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    axes.set_aspect('equal')
+    axes.set(xlabel='x (m)', ylabel='y (m)')
+    axes.grid(alpha=0.3)
+    axes.set_axisbelow(True)

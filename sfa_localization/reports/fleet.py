@@ -19,7 +19,8 @@ _COLUMNS = ('garden', 'state', 'why', 'tested error of the filter: mean (m)', '9
             'age of the training (days)', 'change of the error (m)', 'pages')  # fmt: skip
 _SCRIPT = """
 <style>body { max-width: none; } th { cursor: pointer; } td { vertical-align: top; }
-th:nth-child(-n+3), td:nth-child(-n+3) { text-align: left; } td:nth-child(3) { min-width: 20rem; }
+th:nth-child(-n+3), td:nth-child(-n+3) { text-align: left; }
+td:nth-child(3) { min-width: min(20rem, 40vw); }
 </style><script>
 const body = document.querySelector('tbody'), rows = [...body.rows];
 document.querySelector('thead').onclick = ({target}) => {

@@ -1,7 +1,7 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A self-contained HTML page, also for phones and dark screens: figures are part of the file, and
-there are no scripts."""
+"""An HTML page, also for phones and dark screens: figures are part of the file, and its words and
+tables need no script."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ th, td { padding: 0.2rem 0.7rem; border-bottom: 1px solid var(--line); text-alig
 th:first-child, td:first-child { text-align: left; }
 @media (max-width: 40rem) {
   body { padding: 0.6rem; }
-  th, td { padding: 0.2rem 0.4rem; }
+  table { font-size: 0.8rem; }
+  th, td { padding: 0.2rem 0.3rem; }
   .broad img { max-width: none; height: 22rem; width: auto; }
 }
 """
@@ -86,13 +87,18 @@ def figure(path: Path, caption: str) -> str:
 
     Raises LocalizationError.
     """
-    compressed = BytesIO()
     try:
         with Image.open(path) as picture:
-            width, height = picture.size
-            picture.convert('RGB').save(compressed, 'WEBP', quality=QUALITY)
+            return embedded(picture, caption)
     except OSError as error:
         raise LocalizationError(f'{path}: cannot be read: {error.strerror or error}') from None
+
+
+def embedded(picture: Image.Image, caption: str, quality: int = QUALITY) -> str:
+    """A picture as a part of the page, compressed with this quality."""
+    compressed = BytesIO()
+    width, height = picture.size
+    picture.convert('RGB').save(compressed, 'WEBP', quality=quality)
     data = base64.b64encode(compressed.getvalue()).decode()
     words = escape(caption)
     shape = ' broad' if width > BROAD * height else ''

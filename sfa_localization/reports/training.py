@@ -17,7 +17,6 @@ from sfa_localization.inspection import InspectionConfig, covered_share, sparse_
 from sfa_localization.mapping.forecast import Forecast
 from sfa_localization.reports import figures, page
 from sfa_localization.reports.bag import motion_section
-from sfa_localization.reports.evaluation import firing_maps_figure
 from sfa_localization.reports.figures import WorstImage
 from sfa_localization.reports.summary import has_forecast, judgment, summary
 from sfa_localization.training import Trained
@@ -32,7 +31,7 @@ SHOWN = 95
 _CAPTIONS = {
     'coverage': 'Where images were taken (black), on the expected error of one image',
     'line_fits': 'Each segment by odometry (wide) and by slow features (thin)',
-    'firing_maps': 'Slow features at the places of the images: good ones change smoothly',
+    'firing_maps': figures.FIRING_CAPTION,
     'lens': 'The lens that the drive shows: elevations (green) in an image and in its panorama, '
     'whose edges are yellow',
     'worst_images': 'Images that the map puts farthest from where they were taken',
@@ -94,7 +93,7 @@ def _figures(
     places = trained.metric.poses[:, :2]
     coverage_figure(folder / 'coverage.png', trained, places)
     line_fits_figure(folder / 'line_fits.png', trained, places)
-    firing_maps_figure(folder / 'firing_maps.png', places, trained.features[images])
+    figures.firing_maps_figure(folder / 'firing_maps.png', places, trained.features[images])
     if samples:
         figures.write_worst_images(folder / 'worst_images.png', samples)
     if lens:
@@ -162,7 +161,7 @@ def advice(trained: Trained, places: Array) -> list[str]:
 
 def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
     """Draw where images were taken, (M, 2) m, on the expected error around them."""
-    figure = Figure(figsize=(7.0, 6.0), layout='constrained')
+    figure = Figure(figsize=figures.SQUARE, layout='constrained')
     axes = figure.subplots()
     expected = trained.metric.forecast
     local = expected.local
@@ -188,7 +187,7 @@ def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
 
 def line_fits_figure(path: Path, trained: Trained, places: Array) -> None:
     """Draw every segment by odometry (places (M, 2) m) and by the slow features."""
-    figure = Figure(figsize=(7.0, 6.0), layout='constrained')
+    figure = Figure(figsize=figures.SQUARE, layout='constrained')
     axes = figure.subplots()
     predicted = places - trained.metric.residuals
     start = 0

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.reports import page
-from sfa_localization.reports.figures import as_title, in_meters, save
+from sfa_localization.reports.figures import SQUARE, as_title, in_meters, save
 
 
 def write_update_report(
@@ -44,7 +44,7 @@ def write_update_report(
 
 def keyframes_figure(path: Path, keyframes: Sequence[tuple[str, Array]]) -> None:
     """Draw where the keyframes of each drive were taken, poses (K, 3) by its name."""
-    figure = Figure(figsize=(7.0, 6.0), layout='constrained')
+    figure = Figure(figsize=SQUARE, layout='constrained')
     axes = figure.subplots()
     for number, (name, poses) in enumerate(keyframes):
         style = {'markersize': 5} if number else {'markersize': 3, 'color': '0.7'}

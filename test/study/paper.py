@@ -28,7 +28,7 @@ from sfa_localization.metric.segments import Segments, assignment
 from sfa_localization.metric.stack import Stack
 from sfa_localization.motion.settings import SegmentConfig
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.reports.evaluation import firing_maps_figure
+from sfa_localization.reports.figures import firing_maps_figure
 from study import paper_report as report
 from study.results import Cell, Results
 from study.sites import Site

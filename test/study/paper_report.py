@@ -21,8 +21,7 @@ from page_tables import markdown
 from places import distances
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.reports.evaluation import MARGIN_M, TRUTH
-from sfa_localization.reports.figures import save
+from sfa_localization.reports.figures import MARGIN_M, save
 
 Cells = Sequence[Mapping[str, Any]]
 
@@ -166,7 +165,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
     away = 0.0 if panel.aligned else np.nanmean(panel.truth - panel.estimate, axis=0)
     estimate = panel.estimate + away
     if panel.groups is None:
-        axes.plot(*panel.truth.T, **{**TRUTH, 'linewidth': 3.0})
+        axes.plot(*panel.truth.T, color='0.72', linewidth=3.0, solid_capstyle='round', zorder=1)
         axes.plot(*estimate.T, color='#0072B2', linewidth=1.0)
     else:
         for number, group in enumerate(np.unique(panel.groups)):
