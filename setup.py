@@ -82,7 +82,13 @@ setup(
         # The workers of `fleet` on several machines.
         'fleet': ['dask>=2024.1', 'distributed>=2024.1'],
         # colcon finds the test runner by this name.
-        'test': ['pytest>=7.4', 'hypothesis>=6.82', 'psutil>=5.9', 'filterpy>=1.4.5', 'selenium>=4.10'],
+        'test': [
+            'pytest>=7.4',
+            'hypothesis>=6.82',
+            'psutil>=5.9',
+            'filterpy>=1.4.5',
+            'selenium>=4.10',
+        ],
         'dev': ['ruff==0.17.5', 'mypy==2.4.1', 'types-PyYAML', 'pytest-xdist>=3.3'],
     },
     entry_points={

@@ -52,7 +52,9 @@ def eight(share):
 def cross(share):
     """Along x and back to the middle, then along y to both sides; it turns within 3 m."""
     driven = np.linspace(0, 98, 981)
-    headings = np.interp(driven, [30, 33, 48, 51, 66, 69], np.pi * np.array([0, 1, 1, 0.5, 0.5, 1.5]))
+    headings = np.interp(
+        driven, [30, 33, 48, 51, 66, 69], np.pi * np.array([0, 1, 1, 0.5, 0.5, 1.5])
+    )
     path = np.cumsum(np.exp(1j * headings)) * 0.1
     at = np.interp(share * driven[-1], driven, path)
     return at.real, at.imag
