@@ -150,6 +150,15 @@ def test_a_bag_that_loops_starts_the_filter_anew(seconds):
     assert looped.status.level is Level.LOCALISED
 
 
+def test_images_are_not_fused_anew_for_each_odometry_that_comes_late(monkeypatch):
+    drive, steps, step = FilterDrive(seconds=2, every=2, **NOISY), [], Ekf.step
+    monkeypatch.setattr(Ekf, 'step', lambda *given: steps.append(given[2]) or step(*given))
+    first, *events = drive.events()
+    fused = fed(started(), drive, [first, *sorted(events, key=lambda event: -event[1])])
+    assert len(steps) < 3 * len(events)
+    assert snapshot(fused) == snapshot(fed(started(), drive))
+
+
 def test_odometry_that_was_held_up_does_not_come_once_more():
     drive = FilterDrive(seconds=12)
     held = drive.events(6, 8)

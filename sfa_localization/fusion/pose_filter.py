@@ -51,6 +51,7 @@ from sfa_localization.fusion.timeline import (
     POSE,
     ClockWentBack,
     Timeline,
+    odometry_ns,
 )
 
 __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
@@ -252,9 +253,9 @@ class PoseFilter:
         """
         if stamp_ns <= 0 or not math.isfinite(yaw_rad) or self.waited_s:
             return
-        odometry_ns = self._history.newest.odometry.stamp_ns
-        if odometry_ns is not None:
-            finder = self._images.add_heading(int(stamp_ns), yaw_rad, odometry_ns)
+        counted_ns = odometry_ns(self._history)
+        if counted_ns is not None:
+            finder = self._images.add_heading(int(stamp_ns), yaw_rad, counted_ns)
             if finder is not None:
                 self._camera = finder
                 self._expected_s = 0.0

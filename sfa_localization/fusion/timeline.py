@@ -33,6 +33,14 @@ class ClockWentBack(Exception):
     """The clock went back: the filter has to start anew."""
 
 
+def odometry_ns(history: History[Event, Belief]) -> int | None:
+    """The stamp of the newest odometry; None without any. It needs no belief: while odometry comes
+    late, each would be made anew from there on.
+    """
+    last_ns = history.last_ns(ODOMETRY)
+    return history.oldest.odometry.stamp_ns if last_ns is None else last_ns
+
+
 class Timeline:
     """Decides by the stamps of all messages, in the order of arrival, which can be used."""
 
@@ -55,7 +63,7 @@ class Timeline:
         Odometry in order ends the row.
         """
         newest_ns = history.newest_ns
-        if newest_ns is None or history.newest.odometry.stamp_ns is None or self._retaking:
+        if newest_ns is None or odometry_ns(history) is None or self._retaking:
             return
         ahead_ns = stamp_ns - newest_ns
         if kind == MEASUREMENT:
@@ -85,7 +93,7 @@ class Timeline:
         if stamp_ns <= 0:
             raise DataError('zero or negative stamp')
         newest_ns = history.newest_ns
-        odometry_ns = history.newest.odometry.stamp_ns
+        counted_ns = odometry_ns(history)
         if newest_ns is None:
             return
         reason = ''
@@ -93,14 +101,14 @@ class Timeline:
             reason = 'too old'
         elif history.holds((stamp_ns, kind)):
             reason = 'duplicate stamp'
-        if kind == ODOMETRY or odometry_ns is None:  # the odometry keeps the time
+        if kind == ODOMETRY or counted_ns is None:  # the odometry keeps the time
             self._behind = self._behind + 1 if reason else 0
         if reason and self._behind >= FEW_BEHIND:
             raise ClockWentBack
         if reason:
             raise DataError(reason)
         if kind == ODOMETRY:
-            self._notice_again(stamp_ns, odometry_ns, history)
+            self._notice_again(stamp_ns, counted_ns, history)
 
     @property
     def problems(self) -> list[str]:
