@@ -503,9 +503,7 @@ def _false_localised_s(truth: Trajectory, ekf: Trajectory, localised: Mask) -> f
 
 def moved(estimate: Trajectory, transform: RigidTransform) -> Trajectory:
     """The trajectory in the frame to which the transform leads."""
-    positions = transform.apply(estimate.poses[:, :2])
-    yaw = transform.apply_yaw(estimate.poses[:, 2])
-    return Trajectory(estimate.stamps_ns, np.column_stack([positions, yaw]))
+    return Trajectory(estimate.stamps_ns, compose(transform.pose, estimate.poses))
 
 
 def odometry_from_start(truth: Trajectory, run: Run) -> Trajectory:

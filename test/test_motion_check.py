@@ -441,7 +441,7 @@ def test_a_faulty_truth_is_corrected(name):
     frame = align(poses[:, :2], right[:, :2])
     assert distances(frame.apply(poses[:, :2]), right).max() < 0.03
     assert mended.headings == (name != 'no headings')
-    assert np.abs(wrap_angle(frame.apply_yaw(poses[:, 2]) - right[:, 2])).max() < np.deg2rad(10.0)
+    assert np.abs(wrap_angle(poses[:, 2] + frame.yaw_rad - right[:, 2])).max() < np.deg2rad(10.0)
 
 
 def test_a_short_drive_has_the_offset_of_the_truth_of_other_drives_if_it_fits():

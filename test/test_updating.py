@@ -70,7 +70,7 @@ def test_what_a_changed_place_adds_lies_where_it_was_seen():
     at, truth = drive().odometry.poses[likest], map_of_truth()
     distances = np.hypot(*(new.poses[:, :2] - truth.apply(at[:, :2])).T)
     assert np.percentile(distances, 95) < 2 * updating.CERTAIN_M
-    assert np.abs(wrap_angle(new.poses[:, 2] - truth.apply_yaw(at[:, 2]))).max() < 0.1
+    assert np.abs(wrap_angle(new.poses[:, 2] - at[:, 2] - truth.yaw_rad)).max() < 0.1
 
 
 def test_the_page_of_an_update_shows_what_each_drive_added(tmp_path):

@@ -28,9 +28,7 @@ def write_replay(path: Path, result: Evaluation, ground: DrivenGround) -> None:
     """
     start_ns = result.steps[0].stamp_ns
     with BagWriter(path) as bag:
-        transform = result.transform
-        of_map = np.array([transform.x_m, transform.y_m, transform.yaw_rad])
-        bag.static_transform(start_ns, invert(of_map), (_MAP, _TRUTH))
+        bag.static_transform(start_ns, invert(result.transform.pose), (_MAP, _TRUTH))
         cells = ground.cells(GroundConfig())
         bag.grid('/sfa/map', start_ns, cells.driven, cells.corner, cells.size_m, _MAP)
         ends = ground.places[ground.lines.ravel()]

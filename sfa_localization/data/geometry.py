@@ -69,13 +69,14 @@ class RigidTransform:
     y_m: float
     yaw_rad: float
 
+    @property
+    def pose(self) -> Array:
+        """Where it leads the origin (3,) [x m, y m, yaw rad]: it composes with poses."""
+        return np.array([self.x_m, self.y_m, self.yaw_rad])
+
     def apply(self, points: Array) -> Array:
         """Transform points (N, 2) in meters."""
         return np.asarray(points @ rotation(self.yaw_rad).T + [self.x_m, self.y_m])
-
-    def apply_yaw(self, yaw_rad: Array) -> Array:
-        """Transform headings (N,)."""
-        return wrap_angle(yaw_rad + self.yaw_rad)
 
 
 def align(source: Array, target: Array) -> RigidTransform:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.geometry import Array, compose, relative, wrap_angle
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import (
@@ -206,11 +206,8 @@ class Ekf:
 
     def _moved(self, belief: Belief, stamp_ns: int, step: Step) -> Belief:
         """Apply a prediction to mean, covariance, dead reckoning and the distance traveled."""
-        dx, dy, turn = (step.mean[:3] - belief.mean[:3]).tolist()
-        x, y, yaw = belief.dead_reckoned
-        c = math.cos(yaw - belief.mean[YAW])
-        s = math.sin(yaw - belief.mean[YAW])
-        reckoned = x + c * dx - s * dy, y + s * dx + c * dy, float(wrap_angle(yaw + turn))
+        moved = relative(belief.mean[:3], step.mean[:3])
+        x, y, yaw = compose(np.array(belief.dead_reckoned), moved).tolist()
         images = belief.memory.images
         oldest_ns = images[0].stamp_ns if images else stamp_ns
         predicted = self._kalman.predicted(belief, step) if belief.located else belief.covariance
@@ -218,9 +215,9 @@ class Ekf:
             stamp_ns=stamp_ns,
             mean=step.mean,
             covariance=predicted,
-            dead_reckoned=reckoned,
-            traveled_m=belief.traveled_m + math.hypot(dx, dy),
-            path=belief.path.driven(stamp_ns, reckoned, oldest_ns),
+            dead_reckoned=(x, y, yaw),
+            traveled_m=belief.traveled_m + math.hypot(*moved[:2]),
+            path=belief.path.driven(stamp_ns, (x, y, yaw), oldest_ns),
         )
 
     # Update.
@@ -278,8 +275,7 @@ class Ekf:
             corrected = self._kalman.corrected(belief, z, jacobian, white * outlying**2)
         images = (*images[:-1], images[-1]._replace(accepted=True))
         memory = Memory(memory.support + 1, 0, event.stamp_ns, images, update)
-        mean, covariance = corrected[:2]
-        return belief._replace(mean=mean, covariance=covariance, memory=memory)
+        return belief._replace(mean=corrected.mean, covariance=corrected.covariance, memory=memory)
 
     def _linearized(self, belief: Belief, event: MeasurementEvent) -> tuple[Array, Array, Array]:
         """Value z, Jacobian and white noise of a measurement that is linear in the state. With the
@@ -339,7 +335,6 @@ def _fix(belief: Belief, event: MeasurementEvent) -> PositionFix:
     """A measurement beside the pose by dead reckoning; the uncertain delay adds variance."""
     moving = motion.velocity(belief.mean)[: len(event.value)]
     variances = event.covariance.diagonal() + moving**2 * belief.covariance[DELAY, DELAY]
-    x_variance, y_variance, *yaw_variance = variances.tolist()
     x, y, *yaw = event.value.tolist()
     counted_ns = belief.odometry.stamp_ns
     limit_ns = round(ODOMETRY_TIMEOUT_S * 1e9)
@@ -347,8 +342,8 @@ def _fix(belief: Belief, event: MeasurementEvent) -> PositionFix:
         event.stamp_ns,
         complex(x, y),
         yaw[0] if yaw else math.nan,
-        (x_variance + y_variance) / 2,
-        yaw_variance[0] if yaw else math.inf,
+        float(variances[:2].mean()),
+        float(variances[2]) if yaw else math.inf,
         belief.dead_reckoned,
         belief.traveled_m,
         is_reckoned=counted_ns is not None and event.stamp_ns - counted_ns <= limit_ns,

@@ -53,11 +53,6 @@ class History(Generic[E, B]):
     def newest_ns(self) -> int | None:
         return self._keys[-1][0] if self._keys else self._horizon_ns
 
-    @property
-    def oldest(self) -> B:
-        """The belief before all events that are remembered."""
-        return self._base
-
     def last_ns(self, rank: int) -> int | None:
         """The stamp of the newest event of a rank, without making its belief; None without any."""
         return next((stamp_ns for stamp_ns, kind in reversed(self._keys) if kind == rank), None)

@@ -34,11 +34,11 @@ class ClockWentBack(Exception):
 
 
 def odometry_ns(history: History[Event, Belief]) -> int | None:
-    """The stamp of the newest odometry; None without any. It needs no belief: while odometry comes
-    late, each would be made anew from there on.
+    """The stamp of the newest odometry; None without any. Where some is remembered it needs no
+    belief: while odometry comes late, each would be made anew from there on.
     """
     last_ns = history.last_ns(ODOMETRY)
-    return history.oldest.odometry.stamp_ns if last_ns is None else last_ns
+    return history.newest.odometry.stamp_ns if last_ns is None else last_ns
 
 
 class Timeline:

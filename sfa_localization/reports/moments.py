@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from PIL import Image as Pictures
 
-from sfa_localization.data.geometry import Array, Indices, RigidTransform, rotation, wrap_angle
+from sfa_localization.data.geometry import (
+    Array,
+    Indices,
+    RigidTransform,
+    compose,
+    rotation,
+    wrap_angle,
+)
 from sfa_localization.data.run import Image
 from sfa_localization.keyframes.likest import Likest, likest
 from sfa_localization.reports import page
@@ -41,7 +48,7 @@ class Estimate(NamedTuple):
         """From an estimate in the map, which the transform leads to the frame of the truth."""
         turn = np.eye(3)
         turn[:2, :2] = rotation(transform.yaw_rad)
-        return cls(_moved(transform, pose), turn @ covariance @ turn.T)
+        return cls(compose(transform.pose, pose), turn @ covariance @ turn.T)
 
 
 class Moment(NamedTuple):
@@ -88,8 +95,8 @@ def moments_of(result: Evaluation, model: PlaceModel) -> list[Moment]:
 
 def _chosen(result: Evaluation, steps: Sequence[Step], truth: Array) -> Indices:
     """Rows of at most MOST images, among them the worst ones."""
-    poses = [_moved(result.transform, step.image.pose) for step in steps if step.image]
-    errors = np.hypot(*(np.array(poses) - truth)[:, :2].T)
+    poses = [step.image.pose for step in steps if step.image]
+    errors = np.hypot(*(compose(result.transform.pose, np.array(poses)) - truth)[:, :2].T)
     used = [step.image is not None and not step.image.problem for step in steps]
     judged = np.flatnonzero(np.isfinite(errors) & used)
     worst = [judged[one.row] for one in worst_images(truth[judged, :2], errors[judged])]
@@ -111,18 +118,12 @@ def _moment(
         seconds,
         panorama[0],
         match,
-        _moved(transform, match.pose),
+        compose(transform.pose, match.pose),
         truth,
         Estimate.of(transform, step.image.pose, step.image.covariance),
         step.image.problem,
         Estimate.of(transform, state.pose, state.pose_covariance) if state else None,
     )
-
-
-def _moved(transform: RigidTransform, pose: Array) -> Array:
-    """A pose (3,) of the map in the frame of the truth."""
-    place = transform.apply(pose[None, :2])[0]
-    return np.array([*place, *transform.apply_yaw(pose[2:])])
 
 
 def cards(moments: Sequence[Moment]) -> str:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from page_tables import markdown
 
-from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.evaluation import WRONG_M
 
 WRONG_DEG = 15.0
@@ -42,8 +42,7 @@ def output(second, status, pose, covariance, true, transform):
     """Compare a pose (3,) in the map, with covariance (3, 3), with the truth (3,), to which a
     transform leads.
     """
-    x, y = transform.apply(np.array(pose[:2])[None])[0]
-    yaw = float(transform.apply_yaw(np.array(pose[2])))
+    x, y, yaw = compose(transform.pose, pose).tolist()
     return Output(
         second,
         status.level.name,

@@ -69,14 +69,13 @@ def filmed(messages, start_ns):
 
 def in_truth(message):
     """Pose (3,) and covariance (2, 2) of an odometry message, turned into the truth's frame."""
-    from sfa_localization.data.geometry import rotation
+    from sfa_localization.data.geometry import compose, rotation
     from sfa_localization.nodes.conversions import read_odometry
 
     transform, pose = to_truth(), np.array(read_odometry(message)[2])
     turn = rotation(transform.yaw_rad)
     spread = np.reshape(message.pose.covariance, (6, 6))[:2, :2]
-    yaw = float(transform.apply_yaw(pose[2]))
-    return np.append(transform.apply(pose[None, :2])[0], yaw), turn @ spread @ turn.T
+    return compose(transform.pose, pose), turn @ spread @ turn.T
 
 
 def draw(figure, path, shots, k):

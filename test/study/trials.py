@@ -238,8 +238,8 @@ def start_of(run: Run) -> Array:
 
 def true_start(run: Run, transform: RigidTransform) -> FilterConfig:
     """The filter's settings for a start at the true pose; `transform` leads from map to truth."""
-    laid = np.array([transform.x_m, transform.y_m, transform.yaw_rad])
-    return replace(TRUE_START, initial_pose=tuple(compose(invert(laid), start_of(run)).tolist()))
+    start = compose(invert(transform.pose), start_of(run))
+    return replace(TRUE_START, initial_pose=tuple(start.tolist()))
 
 
 def scores_of(judged: Evaluation) -> Cell:
