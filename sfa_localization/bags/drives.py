@@ -229,6 +229,8 @@ def unwrapper_of(bag: Bag, topic: str, recipe: ReadingRecipe) -> Unwrapper:
 class _OneCamera:
     """The images of one camera of a bag, and their panoramas."""
 
+    lacking = ''
+
     def __init__(self, bag: Bag, recipe: ReadingRecipe) -> None:
         self._topic = bag.find('image', recipe.topics.image)
         self.total = bag.topics[self._topic].count
@@ -239,8 +241,6 @@ class _OneCamera:
     def streams(self, bag: Bag, convert: Callable[[Any], Any]) -> dict[str, Stream]:
         """The stream of panoramas, which `convert` makes of images."""
         return {'images': bag.stream(self._topic, convert)}
-
-    lacking = ''
 
     def follow(self, odometry: Stream) -> None:
         """Take no part in the odometry."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from sfa_localization.camera.video import ImageReader
 from sfa_localization.data.errors import CameraError, ConfigError, LocalizationError
-from sfa_localization.data.image_topics import TRANSPORTS
+from sfa_localization.data.image_topics import TRANSPORTS, info_topic
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.data.run import Image
 from sfa_localization.nodes.lifecycle import LocalizationNode, sensor_qos
@@ -18,6 +18,11 @@ from sfa_localization.nodes.lifecycle import LocalizationNode, sensor_qos
 _PACKETS = 30
 """Packets of a video that wait, a second of most: a lost one costs all images until a key frame. Of
 other images only the newest waits, as they may come faster than they are used."""
+
+
+def calibration_topic(node: LocalizationNode, info: str, images: str) -> str:
+    """The topic of the calibration of images: the one beside them, unless `info` is remapped."""
+    return info if node.is_remapped(info) else info_topic(node.full_name(images))
 
 
 class ImageInput:

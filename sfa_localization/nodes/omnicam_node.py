@@ -35,14 +35,14 @@ from sfa_localization.camera.settings import (
 from sfa_localization.camera.surround import Surround
 from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import ConfigError, MessageError
-from sfa_localization.data.image_topics import CAMERA_INFO, info_topic
+from sfa_localization.data.image_topics import CAMERA_INFO
 from sfa_localization.data.messages import read_stamp, read_tilt
 from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes import lifecycle
 from sfa_localization.nodes.discovery import Discovery
-from sfa_localization.nodes.image_input import ImageInput
+from sfa_localization.nodes.image_input import ImageInput, calibration_topic
 from sfa_localization.nodes.lifecycle import ERROR, OK, WARN
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.parameters import Current
@@ -211,15 +211,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
             if self._lens is None and not self.settings(CameraConfig).is_described:
                 take = self._take_calibration
                 qos = lifecycle.sensor_qos(1)
-                topic = self._info_topic
+                topic = calibration_topic(self, CAMERA_INFO, self._input)
                 self._calibrations = self.subscribe(CameraInfo, CAMERA_INFO, take, qos, topic)
-
-    @property
-    def _info_topic(self) -> str:
-        """The topic beside that of the images, unless remapped."""
-        if self.is_remapped(CAMERA_INFO):
-            return CAMERA_INFO
-        return info_topic(self.full_name(self._input))
 
     def _take_calibration(self, message: CameraInfo) -> None:
         """Use the first that describes a lens."""

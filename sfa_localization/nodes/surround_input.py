@@ -23,12 +23,12 @@ from sfa_localization.camera.settings import LensCalibration, SurroundConfig
 from sfa_localization.camera.surround import Surround, require_rig
 from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.image_topics import CAMERA_INFO, info_topic
+from sfa_localization.data.image_topics import CAMERA_INFO
 from sfa_localization.data.messages import read_odometry, read_stamp
 from sfa_localization.data.run import Image
 from sfa_localization.data.transforms import BASE, TOPIC, TransformTree
 from sfa_localization.nodes.discovery import Discovery
-from sfa_localization.nodes.image_input import ImageInput
+from sfa_localization.nodes.image_input import ImageInput, calibration_topic
 from sfa_localization.nodes.lifecycle import (
     ERROR,
     OK,
@@ -59,8 +59,7 @@ class Descriptions:
         """Subscribe to what is not known."""
         for name in self._topics.keys() - self._lenses.keys():
             info = f'{name}/{CAMERA_INFO}'
-            beside = info_topic(self._node.full_name(self._topics[name]))
-            topic = info if self._node.is_remapped(info) else beside
+            topic = calibration_topic(self._node, info, self._topics[name])
             take = partial(self._take_info, name)
             described = self._node.subscribe(CameraInfo, info, take, sensor_qos(1), topic)
             self._subscriptions.append(described)
