@@ -46,6 +46,12 @@ def start_chain(bench, model):
     ]
 
 
+def as_sent(topic, data):
+    """The topic and the message of a record, as a camera publishes its panoramas."""
+    topic = '/panorama_raw/compressed' if topic.startswith('/panorama') else topic
+    return topic, deserialize_message(data, KINDS[topic])
+
+
 def driver(bench, counted):
     """Sends recorded messages through DDS, as fast as they are counted."""
     create = bench.node.create_publisher
@@ -54,9 +60,9 @@ def driver(bench, counted):
 
     def drive(messages):
         before = counted()
-        for number, (topic, _, data, _) in enumerate(messages, before + 1):
-            topic = '/panorama_raw/compressed' if topic.startswith('/panorama') else topic
-            topics[topic].publish(deserialize_message(data, KINDS[topic]))
+        for number, (recorded, _, data, _) in enumerate(messages, before + 1):
+            topic, message = as_sent(recorded, data)
+            topics[topic].publish(message)
             assert until(lambda: counted() > number - 40)  # noqa: B023
         assert until(lambda: counted() == before + len(messages))
 
@@ -71,9 +77,8 @@ def passed_on(bench, chain):
         '/odom': [ekf['odom']],
         '/panorama_raw/compressed': [omnicam['image_raw/compressed'], sfa['panorama'], ekf[SEEN]],
     }
-    for topic, _, data, _ in records(TEST, '/odom', '/panorama/compressed'):
-        topic = '/panorama_raw/compressed' if topic.startswith('/panorama') else topic
-        message = deserialize_message(data, KINDS[topic])
+    for recorded, _, data, _ in records(TEST, '/odom', '/panorama/compressed'):
+        topic, message = as_sent(recorded, data)
         due = [monitor.received + 1 for monitor in through[topic]]
         sent[topic].publish(message)
         assert until(lambda: [each.received for each in through[topic]] == due)  # noqa: B023

@@ -153,13 +153,18 @@ def test_the_slider_and_the_buttons_of_the_worst_images(browser, evaluated):
     assert shown(browser)['stamp'] == str(worst.stamp_ns)
 
 
+def write_results(file, result):
+    """As `evaluate --json` does."""
+    curves = curves_of(result.truth, result.estimates)
+    told = {**result.as_dict(), 'grade': 'good', 'sentence': 'right', 'curves': curves}
+    file.write_text(json.dumps(told))
+
+
 def test_two_results_are_linked_in_the_same_plots(browser, evaluated, tmp_path):
     _, result, _ = evaluated
     files = [tmp_path / 'before.json', tmp_path / 'after.json']
     for file in files:
-        told = {**result.as_dict(), 'grade': 'good', 'sentence': 'right'}
-        curves = curves_of(result.truth, result.estimates)
-        file.write_text(json.dumps({**told, 'curves': curves}))
+        write_results(file, result)
     assert main(['evaluate', *map(str, files), '--report', str(tmp_path / 'report')]) == 0
     open_page(browser, tmp_path / 'report', 1280, 'dark')
     seconds = click(browser, 1, 'after.json: SFA, one image each')
@@ -176,9 +181,7 @@ def test_a_page_is_small_and_a_fleet_shares_one_script(evaluated, tmp_path):
     inside.mkdir(parents=True)
     shutil.copy(folder / SCRIPT, shared)
     files = [tmp_path / 'one.json'] * 2
-    told = {**result.as_dict(), 'grade': 'good', 'sentence': 'right'}
-    curves = curves_of(result.truth, result.estimates)
-    files[0].write_text(json.dumps({**told, 'curves': curves}))
+    write_results(files[0], result)
     assert main(['evaluate', *map(str, files), '--report', str(inside)]) == 0
     assert f'src="../../{SCRIPT}"' in (inside / PAGE).read_text('utf-8')
     assert not (inside / SCRIPT).exists()

@@ -161,15 +161,19 @@ def test_seams_pass_from_one_camera_to_the_other_within_their_overlap():
     assert np.abs(np.diff(shares['front'])).max() < 0.13  # no step
 
 
+def exposed(gains, scene=smooth):
+    """A panorama of cameras whose exposures have settled."""
+    surround = Surround(rig(), PANORAMA)
+    for number in range(3):
+        images = {c.name: picture(c, scene, gain=gains[c.name]) for c in rig()}
+        made = feed(surround, number, images)
+    return made[-1][1].astype(float)
+
+
 def test_exposures_are_balanced_where_views_overlap():
     """Factors up to 1.6 between neighbors vanish; the mean brightness stays."""
-    cameras = rig()
     gains = {'front': 1.0, 'left': 0.7, 'rear': 1.0, 'right': 1.1}
-    surround = Surround(cameras, PANORAMA)
-    for number in range(3):
-        images = {c.name: picture(c, gain=gains[c.name]) for c in cameras}
-        made = feed(surround, number, images)
-    ratio = made[-1][1][..., 2] / direct()[..., 2]
+    ratio = exposed(gains)[..., 2] / direct()[..., 2]
     mean = np.exp(np.mean(np.log([*gains.values()])))
     assert_allclose(ratio, mean, rtol=0.04)
 
@@ -182,11 +186,7 @@ def test_a_sky_that_some_cameras_cut_off_is_the_same_in_all_headings():
     def scene(rays):
         return np.where(rays[:, 2:] > 0.2, 230.0, smooth(rays) / 2)
 
-    surround = Surround(rig(), PANORAMA)
-    for number in range(3):
-        images = {c.name: picture(c, scene, gain=gains[c.name]) for c in rig()}
-        made = feed(surround, number, images)
-    panorama = made[-1][1].astype(float)
+    panorama = exposed(gains, scene)
     assert_allclose(panorama[:15], 255 / 1.3 * scale, atol=4)
     ground = panorama[45:] / direct(lambda rays: smooth(rays) / 2)[45:]
     assert_allclose(np.median(ground, axis=(0, 1)), scale, rtol=0.03)
@@ -194,11 +194,7 @@ def test_a_sky_that_some_cameras_cut_off_is_the_same_in_all_headings():
 
 def test_one_camera_exposed_far_more_than_others_does_not_darken_them():
     gains = {'front': 0.4, 'left': 0.4, 'rear': 0.4, 'right': 1.2}
-    surround = Surround(rig(), PANORAMA)
-    for number in range(3):
-        images = {c.name: picture(c, gain=gains[c.name]) for c in rig()}
-        made = feed(surround, number, images)
-    ahead = made[-1][1][:, 295:305].astype(float)
+    ahead = exposed(gains)[:, 295:305]
     assert ahead.max() > 115  # the white of the right camera is 112
 
 

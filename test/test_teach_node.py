@@ -185,7 +185,7 @@ def test_a_drive_is_taught_and_learned(bench, chain, taught, tmp_path):
     assert until(lambda: 'is written. The map' in said[-1].data, 300.0), said[-1].data
     report = inspect(recorded)
     assert report.lacks == [] and report.problems == []
-    assert {name: topic.count for name, topic in ((t.name, t) for t in report.topics)} == {
+    assert {topic.name: topic.count for topic in report.topics} == {
         '/odom': 3176, '/imu': 3176, '/panorama_raw/compressed': 427,
     }  # fmt: skip
     model = PlaceModel.load(tmp_path / 'garden.npz')
