@@ -46,8 +46,9 @@ troubles: $(READY)  ## train on recorded drives with each trouble, print errors 
 map: $(READY)  ## draw the map of the demo: resource/map.png
 	PYTHONPATH=.:test $(PY) -m study.map_picture demo/model.npz demo/test resource/map.png
 
-animation: $(READY)  ## film the three nodes while the robot is kidnapped: resource/kidnapped.webp
+animation: $(READY)  ## film the nodes of a kidnapped robot, and of one that is taught: resource/*.webp
 	PYTHONPATH=.:test $(PY) -m study.animation resource/kidnapped.webp
+	PYTHONPATH=.:test $(PY) -m study.teaching resource/teaching.webp
 
 fuzz: $(READY)  ## thousands of damaged messages, models, bags, YAML and image files (ARGS='-k bags')
 	FUZZ_INPUTS=10000 $(PY) -m pytest -q test/test_fuzz.py $(ARGS)
