@@ -25,7 +25,7 @@ from sfa_localization.bags.drives import as_live, image_folder, read_drive
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.surround_drive import yaws_of
 from sfa_localization.camera.settings import WatchConfig
-from sfa_localization.camera.yaws import KNOCKED_RAD
+from sfa_localization.camera.yaws import AS_TRAINED, KNOCKED_RAD
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import (
     Array,
@@ -166,9 +166,9 @@ def _knocked(bag: Path, recipe: Recipe, progress: bool) -> tuple[str, ...]:
     """Sentences about cameras of a rig that were turned since the training."""
     if not recipe.surround:
         return ()
-    texts = yaws_of(bag, recipe, progress).sentences(KNOCKED_RAD)
-    remedy = 'of what it was in training: mount it as it was, or train again'
-    return tuple(f'{bag.name}: {text} {remedy}' for text in texts)
+    stated = f'{AS_TRAINED}: mount it as it was, or train again'
+    texts = yaws_of(bag, recipe, progress).sentences(stated, KNOCKED_RAD)
+    return tuple(f'{bag.name}: {text}' for text in texts)
 
 
 def _judged(

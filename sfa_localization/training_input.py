@@ -196,8 +196,8 @@ def with_lens(
     around = with_cameras(bags[0], recipe)
     if around.surround:
         yaws = yaws_of(bags[0], around, progress)
-        for text in yaws.sentences():
-            logger.warning('%s: %s of what /tf_static says: taken into account', bags[0], text)
+        for text in yaws.sentences('/tf_static says, which is taken into account'):
+            logger.warning('%s: %s', bags[0], text)
         return replace(around, surround=yaws.corrected(around.surround)), None
     lens = None
     problems = list[CameraError]()

@@ -425,4 +425,4 @@ def test_a_camera_that_was_turned_since_training_is_named_while_the_robot_turns(
         surround._yaws.finish()
     (sentence_of_left,) = surround.knocked
     assert sentence_of_left.startswith('camera left looks 10.')
-    assert sentence_of_left.endswith('to the left')
+    assert sentence_of_left.endswith('to the left of what it was in training')

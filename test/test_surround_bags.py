@@ -20,7 +20,14 @@ from sfa_localization.bags.surround_drive import with_cameras, yaws_of
 from sfa_localization.bags.surround_topics import camera_name, cameras_of
 from sfa_localization.camera.encodings import read_image
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
-from sfa_localization.camera.yaws import KNOCKED_RAD, Sighting, YawComparison, pairs, turned
+from sfa_localization.camera.yaws import (
+    AS_TRAINED,
+    KNOCKED_RAD,
+    Sighting,
+    YawComparison,
+    pairs,
+    turned,
+)
 from sfa_localization.data.errors import BagError, CameraError
 from sfa_localization.inspection import inspect
 
@@ -204,16 +211,16 @@ def test_errors_of_yaws_are_recovered_beside_parallax_and_turns():
     estimated = np.degrees([yaws.errors[name].value for name in names])
     assert_allclose(estimated, np.degrees(errors), atol=0.1)
     assert yaws.inverse == pytest.approx(0.2, abs=0.01)
-    texts = yaws.sentences()
+    texts = yaws.sentences('was stated')
     assert [text.split(' (')[0] for text in texts] == [
         'camera front looks 2.0 degrees', 'camera rear looks 3.0 degrees',
     ]  # fmt: skip
-    assert texts[0].endswith('to the left') and texts[1].endswith('to the right')
+    assert 'to the left of what was stated' in texts[0] and 'to the right of' in texts[1]
 
 
 def test_without_sightings_no_yaw_is_certain():
     yaws = YawComparison(rig(), PanoramaConfig()).fit([])
-    assert yaws.sentences() == [] and yaws.corrected(rig()) == tuple(rig())
+    assert yaws.sentences('') == [] and yaws.corrected(rig()) == tuple(rig())
 
 
 @pytest.fixture(scope='module')
@@ -236,14 +243,41 @@ def test_a_turning_robot_shows_the_yaws_of_its_cameras(whirl):
     assert_allclose(estimated, [3, 0, -11, 0], atol=0.4)
     for corrected, right in zip(yaws.corrected(recipe.surround), true, strict=True):
         assert corrected.yaw == pytest.approx(right.yaw, abs=np.radians(0.4))
-    (knocked,) = yaws.sentences(KNOCKED_RAD)
-    assert knocked.startswith('camera rear looks 1') and knocked.endswith('to the right')
+    (knocked,) = yaws.sentences(AS_TRAINED, KNOCKED_RAD)
+    assert knocked.startswith('camera rear looks 1') and 'to the right of what it was in' in knocked
+
+
+def test_a_drive_says_since_when_a_camera_looks_elsewhere_than_in_training(whirl, tmp_path):
+    bag, _ = whirl
+    recipe = with_cameras(bag, ReadingRecipe())
+    lacking = read(bag, tmp_path, as_live(recipe, recipe.panorama, None, recipe.surround)).lacking
+    assert lacking[0] == '' and lacking[-1].startswith('camera rear looks 1')
+    training = replace(recipe, distinct=True)
+    assert {*read(bag, tmp_path, training).lacking} == {''}
+
+
+def test_a_camera_that_shows_nothing_of_what_others_see_is_named():
+    names = [c.name for c in rig()]
+    rng = np.random.default_rng(5)
+
+    def told(views, alike, of_others=0.8):
+        sightings = []
+        for number in range(views):
+            one, other = rng.choice(names[:2] + names[3:], 2, replace=False)
+            shift = np.nan if rng.random() > of_others else 0.0
+            sightings.append(Sighting(one, other, number, shift, 0.1))
+            sightings.append(Sighting('rear', one, number, 0.0 if number < alike else np.nan, 0.1))
+        return YawComparison(rig(), PanoramaConfig()).fit(sightings).sentences('')
+
+    (rear,) = told(20, 0)
+    assert rear.startswith('camera rear shows nothing that the others see')
+    assert told(20, 10) == told(8, 0) == told(20, 0, of_others=0.2) == []
 
 
 def test_yaws_of_the_right_cameras_stay(whirl):
     bag, true = whirl
     recipe = replace(with_cameras(bag, ReadingRecipe()), surround=tuple(true))
-    assert yaws_of(bag, recipe).sentences(np.radians(0.5)) == []
+    assert yaws_of(bag, recipe).sentences('', np.radians(0.5)) == []
 
 
 def test_calibrate_draws_the_seams_and_says_how_the_cameras_look(whirl, tmp_path, capsys):

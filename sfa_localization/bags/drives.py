@@ -279,6 +279,7 @@ class _SeveralCameras:
         camera = recipe.camera
         self._surround = Surround(recipe.surround, recipe.panorama, camera.blind_sectors, PATIENCE)
         self._surround.check()
+        self._compares = not recipe.distinct  # in training yaws are measured beforehand
         self._topics = topics
         self.total = max(bag.topics[topic].count for topic in topics.values())
 
@@ -289,13 +290,15 @@ class _SeveralCameras:
         return {'images': joined.panoramas, **cameras}
 
     def follow(self, odometry: Stream) -> None:
-        """Correct the different times of images by the turns of the odometry."""
+        """Correct the different times of images by the odometry, and compare cameras by it."""
         odometry.passes = functools.partial(self._turned, odometry)
 
     def _turned(self, odometry: Stream, item: Item) -> list[Used]:
-        _, twist = item.value
+        pose, twist = item.value
         if twist is not None:
             self._surround.add_turn_rate(item.stamp_ns, float(twist[1]))
+        if pose is not None and self._compares:
+            self._surround.add_pose(item.stamp_ns, np.array(pose))
         return [(odometry, item.stamp_ns, item.value)]
 
     def unused(self, streams: Mapping[str, Stream]) -> None:
@@ -317,12 +320,14 @@ class _SeveralCameras:
 
     @property
     def lacking(self) -> str:
-        """Which cameras the last panorama has lacked for too long, as on panorama/troubles."""
+        """What is wrong with cameras for too long, as on panorama/troubles."""
         return '; '.join(self._surround.problems)
 
     def panorama(self, images: Joined) -> Image:
         """The panorama of the images of one time. Raises CameraError."""
-        return self._surround.compose(images)
+        panorama = self._surround.compose(images)
+        self._surround.finish()
+        return panorama
 
 
 def _images_of(bag: Bag, recipe: ReadingRecipe) -> _OneCamera | _SeveralCameras:

@@ -31,7 +31,7 @@ BRIDGED_S = 3.0
 _POSES = 200  # that are kept: those of a second or more
 _RATES = 1_000_000  # of turns that are kept, 16 bytes each: those of 5 hours at 50 Hz
 _SAMPLED = 4  # every fourth pixel along each axis tells whether a camera is dark or frozen
-_SAME_POSE_NS = 100_000_000  # between the last pose and images whose pose it tells
+_SAME_POSE_NS = 100_000_000  # between images and a pose that tells theirs
 _NEAR_NS = 200_000_000  # an older rate of turn says nothing about an image
 
 
@@ -136,8 +136,12 @@ class Surround:
 
     @property
     def knocked(self) -> list[str]:
-        """Sentences about cameras that look elsewhere than their poses say."""
+        """Sentences about cameras that look elsewhere than stated, or show other things."""
         return self._yaws.sentences
+
+    def finish(self) -> None:
+        """Wait for the comparison of the last images, which tells what is `knocked`."""
+        self._yaws.finish()
 
     def add(self, name: str, stamp_ns: int, image: Image) -> list[tuple[int, Image]]:
         """Take an image (H, W, 3) uint8 of a camera; return the panoramas (H, W, 3) uint8, with
@@ -181,7 +185,7 @@ class Surround:
 
     def _watch_yaws(self, stamp_ns: int, images: Mapping[str, Image]) -> None:
         """Compare what cameras see with what they saw, where a pose is known."""
-        if self._poses and abs(self._poses[-1][0] - stamp_ns) < _SAME_POSE_NS:
+        if any(abs(at_ns - stamp_ns) < _SAME_POSE_NS for at_ns, _ in self._poses):
             stamps_ns, poses = zip(*self._poses, strict=True)
             path = Trajectory(np.array(stamps_ns), np.array(poses))
             self._yaws.add(stamp_ns, path.at(np.array([stamp_ns]))[0], images)

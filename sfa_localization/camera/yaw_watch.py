@@ -13,6 +13,7 @@ import numpy as np
 from sfa_localization.camera.sectors import MountedCamera
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.yaws import (
+    AS_TRAINED,
     KNOCKED_RAD,
     WITHIN_NS,
     Shown,
@@ -26,13 +27,12 @@ from sfa_localization.data.run import Image
 _EVERY_NS = 500_000_000
 """Between images that are compared: a thread takes some 20 ms for two."""
 _KEPT = 30  # pairs: a camera is certain to half a degree with 12, and a knock shows after as many
-_FEWEST = 6
 
 
 class YawWatch:
     """Compares what cameras see, one after another, in the last minute.
 
-    `sentences` name those that were turned; they come from a thread of its own.
+    `sentences` name those that were turned, or show other things; a thread of its own finds them.
     """
 
     def __init__(self, cameras: Sequence[MountedCamera], panorama: PanoramaConfig) -> None:
@@ -76,11 +76,9 @@ class YawWatch:
 
     def _judge(self) -> None:
         """Fit the yaws to the last pairs."""
-        if len(self._pairs) < _FEWEST:
-            return
         numbered = [
             sighting._replace(pair=number)
             for number, sightings in enumerate(self._pairs)
             for sighting in sightings
         ]
-        self.sentences = self._comparison.fit(numbered).sentences(KNOCKED_RAD)
+        self.sentences = self._comparison.fit(numbered).sentences(AS_TRAINED, KNOCKED_RAD)

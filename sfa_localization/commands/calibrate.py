@@ -131,8 +131,8 @@ def _check_several(arguments: argparse.Namespace, recipe: ReadingRecipe) -> int:
     if arguments.check:
         write_bytes(arguments.check, encode_png(image), CameraError)
     print(sentence(recipe.surround))
-    for text in yaws.sentences():
-        print(f'{text} of what /tf_static says')
+    for text in yaws.sentences('/tf_static says'):
+        print(text)
     return 0
 
 
