@@ -83,7 +83,8 @@ def train(
 
     First, images, odometry and gyroscope are compared: a contradiction is an error, or with `force`
     a warning. An interrupted training leaves a checkpoint beside the output; `resume` continues
-    from it and gives the same bytes (the engine mdp starts again). Raises BagError, ConfigError,
+    from it and gives the same bytes (the engine mdp starts again, and so does a training of other
+    bags or parameters, with a warning). Raises BagError, ConfigError,
     DataError or ModelError; then no model is written.
     """
     recipe = recipe or Recipe()

@@ -97,17 +97,23 @@ def test_resuming_gives_the_same_bytes(trained, tmp_path, stages, error):
     assert os.listdir(tmp_path) == ['model.npz']
 
 
-def test_a_damaged_checkpoint_and_that_of_another_training_are_refused(trained, tmp_path):
+def test_a_damaged_checkpoint_and_that_of_another_training_are_named(trained, tmp_path, caplog):
+    """And the training starts anew."""
     output, checkpoint = tmp_path / 'model.npz', tmp_path / '.model.npz.checkpoint.npz'
     cut_off(trained.bag, output, 2, Cut())
+    cut = checkpoint.read_bytes()
     changed = replace(SMALL_RECIPE, network=replace(SMALL_RECIPE.network, seed=5))
     other = write_bag(tmp_path / 'other', seed=8)
-    for bag, by in ((trained.bag, changed), (other, SMALL_RECIPE)):
-        with pytest.raises(ModelError, match='other bags or parameters: train without --resume'):
-            train([bag], output, by, resume=True)
-    checkpoint.write_bytes(checkpoint.read_bytes()[:500])
-    with pytest.raises(ModelError, match='train without --resume'):
-        train([trained.bag], output, SMALL_RECIPE, resume=True)
+    for bag, by, data, why in (
+        (trained.bag, changed, cut, 'made from other bags or parameters'),
+        (other, SMALL_RECIPE, cut, 'made from other bags or parameters'),
+        (trained.bag, SMALL_RECIPE, cut[:500], 'damaged'),
+    ):
+        checkpoint.write_bytes(data)
+        caplog.clear()
+        train([bag], output, by, resume=True)
+        assert why in caplog.text and 'the training starts anew' in caplog.text
+    assert output.read_bytes() == trained.model.read_bytes()
 
 
 @pytest.mark.parametrize('late', [False, True])

@@ -17,7 +17,7 @@ from typing import Any
 from sfa_localization import __version__
 from sfa_localization.bags.recording import METADATA, is_bag, recorded_files
 from sfa_localization.commands import evaluate, inspect, train
-from sfa_localization.data.errors import BagError, LocalizationError, ModelError
+from sfa_localization.data.errors import BagError, LocalizationError
 from sfa_localization.data.files import read_text, write_json
 from sfa_localization.data.plain_yaml import LONGEST
 from sfa_localization.mapping.settings import GroundConfig
@@ -168,10 +168,7 @@ def _train(garden: Garden, config: Sequence[Path | str]) -> Judgment:
     _run(inspect, output / 'inspection.json', *drives, *config, *report)
     words = [*drives, *config, *garden.option('--points', POINTS)]
     words += ['--output', garden.model, '--report', output / 'training']
-    try:
-        return _run(train, output / TRAINING, *words, '--resume')
-    except ModelError:  # the interrupted training was of other bags or parameters
-        return _run(train, output / TRAINING, *words)
+    return _run(train, output / TRAINING, *words, '--resume')
 
 
 def _evaluate(garden: Garden, has_points: bool) -> list[Judgment]:

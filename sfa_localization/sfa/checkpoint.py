@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -21,6 +22,7 @@ from sfa_localization.sfa.network import Architecture, Node
 from sfa_localization.sfa.network_training import Partial
 from sfa_localization.sfa.slowness import LinearSfa
 
+logger = logging.getLogger(__name__)
 FORMAT = 'sfa_localization training checkpoint'
 VERSION = 1
 # So many images of each run enter its fingerprint: enough to notice other recordings.
@@ -66,15 +68,18 @@ class Checkpoint:
         write_arrays(self.path, {**arrays, 'header': np.array(json.dumps(header))})
 
     def read(self, architecture: Architecture) -> Partial | None:
-        """The stages finished so far; None when there are none. Raises ModelError."""
+        """The stages finished so far; None, with a warning, where they cannot be used."""
         if not self.path.is_file():
             return None
-        remedy = 'train without --resume'
-        arrays = read_arrays(self.path, FORMAT, VERSION, remedy)
-        header = json.loads(str(arrays['header']))
-        if header['fingerprint'] != self.fingerprint:
-            raise ModelError(f'{self.path}: made from other bags or parameters: {remedy}')
-        ranks = tuple((int(a), int(b)) for a, b in header['ranks'])
+        try:
+            arrays = read_arrays(self.path, FORMAT, VERSION, 'train')
+            header = json.loads(str(arrays['header']))
+            if header['fingerprint'] != self.fingerprint:
+                raise ModelError(f'{self.path}: made from other bags or parameters')
+        except ModelError as error:
+            logger.warning('%s: the training starts anew', error)
+            return None
+        ranks = tuple((a, b) for a, b in header['ranks'])
         nodes = tuple(
             Node(*(arrays[f'{depth}/{item.name}'] for item in fields(Node)))
             for depth in range(len(ranks))
@@ -83,7 +88,7 @@ class Checkpoint:
         linear = None
         if header['linear_rank'] is not None:
             mean, weights, delta = (arrays[f'linear/{n}'] for n in ('mean', 'weights', 'delta'))
-            linear = LinearSfa(mean, weights, delta, int(header['linear_rank']))
+            linear = LinearSfa(mean, weights, delta, header['linear_rank'])
         return Partial(architecture, nodes, linear, deltas, ranks)
 
     def remove(self) -> None:
