@@ -44,7 +44,7 @@ from taught_drives import (
 from visualization_msgs.msg import MarkerArray
 
 from sfa_localization.nodes.conversions import read_odometry
-from sfa_localization.nodes.lifecycle import latched_qos
+from sfa_localization.nodes.lifecycle import WARN, latched_qos
 from sfa_localization.nodes.teach_node import TeachNode
 from sfa_localization.nodes.worker import Worker
 
@@ -245,16 +245,34 @@ def test_only_what_was_not_taught_goes_on(bench, tmp_path):
     assert not (tmp_path / 'garden_teach').exists()
     os.utime(output, (1.0, 1.0))
     node = bench.run(TeachNode, output=str(output))
-    goes_on = f'waiting for images and odometry to go on with {tmp_path}/garden_drive1'
-    assert until(lambda: said[-1].data == goes_on), said[-1].data
+    goes_on = f'to go on with {tmp_path}/garden_drive1; ~/finish trains on it'
+    assert until(lambda: goes_on in said[-1].data), said[-1].data
     answer = call(bench, 'finish')
     assert answer.success and answer.message.startswith(f'training on {tmp_path}/garden_drive1;')
     assert not call(bench, 'finish').success and not call(bench, 'extend').success
-    assert until(lambda: said[-1].data.startswith('training failed: ')), said[-1].data
+    with mock.patch.object(node, 'get_logger', return_value=mock.Mock()) as logger:
+        assert until(lambda: said[-1].data.startswith('training failed: ')), said[-1].data
+        assert until(lambda: mock.call(said[-1].data) in logger().error.mock_calls)
     assert '--' not in said[-1].data and 'kept for ~/finish' in said[-1].data
     answer = call(bench, 'finish')
     assert answer.success and call(bench, 'cancel').success
     assert said[-1].data == f'canceled; {tmp_path}/garden_drive1: kept for ~/finish'
+
+
+def test_a_training_goes_on_at_the_next_start(bench, tmp_path, monkeypatch):
+    """Unless it was canceled."""
+    record(tmp_path / 'garden_drive1')
+    started = mock.Mock(return_value=mock.Mock(code=None, **{'last_line.return_value': ''}))
+    monkeypatch.setattr('sfa_localization.nodes.teach_node.Worker', started)
+    nodes = [bench.run(TeachNode, output=str(tmp_path / 'garden.npz'))]
+    assert call(bench, 'finish').success
+    for goes_on in (True, False):
+        bench.end(nodes.pop())
+        nodes.append(bench.run(TeachNode, output=str(tmp_path / 'garden.npz')))
+        assert (nodes[0]._recorder is None) == goes_on
+        assert call(bench, 'cancel').success
+    first, again = (each.args[0] for each in started.call_args_list)
+    assert first == again and again[-1] == '--resume'
 
 
 def test_a_clock_that_was_set_back_begins_a_drive_and_files_of_the_future_keep_their_order(
@@ -304,7 +322,12 @@ def test_inputs_that_stop_or_have_two_publishers_are_named(bench, taught):
     assert bench.publish_until('/odom', Odometry(), lambda: twice in said[-1].data)
     second.destroy_node()
     assert until(lambda: twice not in said[-1].data)
-    assert until(lambda: 'nothing comes from /odom' in said[-1].data), said[-1].data
+    stopped = 'nothing comes from /odom'
+    with mock.patch.object(taught, 'get_logger', return_value=mock.Mock()) as logger:
+        assert until(lambda: stopped in said[-1].data), said[-1].data
+    assert logger().warning.mock_calls == [mock.call(stopped)]
+    taught._findings = {'facts': {'drive': ''}}
+    assert taught.health()[0] == WARN
     assert '/imu' not in said[-1].data  # it never sent anything
 
 

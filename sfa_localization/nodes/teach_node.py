@@ -16,7 +16,7 @@ import re
 import shutil
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -71,7 +71,7 @@ class TeachNode(LocalizationNode):
         self._recorder: BagRecorder | None = None
         self._worker: Worker | None = None
         self._recorded: dict[str, Any] = {}
-        self._scratch = ExitStack()
+        self._scratch: Path | None = None
 
     def find_files(self, words: Sequence[str]) -> None:
         """The parameter file is also that of the commands."""
@@ -89,16 +89,21 @@ class TeachNode(LocalizationNode):
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f'{self._folder}: cannot be written: {error.strerror}') from None
-        self._scratch.callback(shutil.rmtree, self._folder, ignore_errors=True)
-        self._judgment = self._folder / 'judgment.json'
         self._is_training = False
+        self._scratch = self._folder
+        self._judgment = self._folder / 'judgment.json'
+        self._finished = self._folder / 'finished'
         self._findings: dict[str, Any] = {}
         self._next_look_s = 0.0
         self._problem = ''
         self._said = ''
         self._topics: dict[str, str] = {}
         self._date_before_now()
-        if self._untaught() or not self._model.exists():
+        drives = self._untaught()
+        if drives and self._finished.exists():
+            self._read_topics(drives[-1])
+            self.get_logger().info(self._train())
+        elif drives or not self._model.exists():
             self._start(next(reversed(self._drives()), self._drive(1)))
         latched = latched_qos()
         self._state = self.publisher(String, 'teach/state', latched)
@@ -123,11 +128,13 @@ class TeachNode(LocalizationNode):
             self._worker.stop()
             self._worker = None
         self._end_recording()
-        self._scratch.close()
+        if self._scratch and not self._is_training:  # with which the next start goes on
+            shutil.rmtree(self._scratch, ignore_errors=True)
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         counts = {} if self._recorder is None else self._recorder.counts
-        level = ERROR if self._problem else WARN if not self._findings else OK
+        is_well = self._findings and not self._troubles()
+        level = ERROR if self._problem else OK if is_well else WARN
         return level, self._said, {topic: str(count) for topic, count in counts.items()}
 
     # Recording.
@@ -171,10 +178,14 @@ class TeachNode(LocalizationNode):
         self._findings = {}
         self._problem = ''
         self._is_set_back = False
-        with suppress(BagError), Bag(folder) as bag:  # of a new drive there is nothing to read
-            self._topics = {without_transport(topic): topic for topic in bag.topics}
+        self._read_topics(folder)
         self._recorder = BagRecorder(folder)
         self.get_logger().info(f'recording into {folder}')
+
+    def _read_topics(self, folder: Path) -> None:
+        """Take the topics of a drive that was begun earlier."""
+        with suppress(BagError), Bag(folder) as bag:  # of a new drive there is nothing to read
+            self._topics = {without_transport(topic): topic for topic in bag.topics}
 
     def _end_recording(self) -> None:
         for subscription in self._recorded.values():
@@ -246,7 +257,6 @@ class TeachNode(LocalizationNode):
         """Stop recording; what is recorded stays."""
         self._problem = f'{error}: the recording ended; make room, then call ~/finish or ~/extend'
         self._recorder = None
-        self.get_logger().error(self._problem)
 
     def _begin_anew(self) -> None:
         """Record a drive of its own: what was recorded is later than now."""
@@ -254,7 +264,6 @@ class TeachNode(LocalizationNode):
         drive = self._next_drive()
         self._start(drive)
         self._problem = f'the clock was set back: {drive} is a drive of its own'
-        self.get_logger().warning(self._problem)
 
     # Looking, and training.
 
@@ -363,20 +372,28 @@ class TeachNode(LocalizationNode):
             said = self._said or f'{self._model} is there: call ~/extend to drive more'
         elif not self._recorder.counts:
             drive = self._recorder.folder
-            earlier = f' to go on with {drive}' if drive in self._drives() else ''
-            said = f'waiting for images and odometry{earlier}'
+            said = 'waiting for images and odometry'
+            if drive in self._drives():
+                said += f' to go on with {drive}; ~/finish trains on it'
         else:
             recording = f'recording {", ".join(self._recorder.counts)}'
             is_driven = any(self._findings.get('drives', []))
             driven = self._findings['facts']['drive'] if is_driven else ''
             judged = [driven, self._verdict()] if self._findings else [recording]
-            said = '; '.join(filter(None, [*self._troubles(), *judged]))
+            troubles = self._troubles()
+            for trouble in troubles:
+                if trouble not in self._said:
+                    self.get_logger().warning(trouble)
+            said = '; '.join(filter(None, [*troubles, *judged]))
         self._publish(said)
 
     def _publish(self, said: str) -> None:
+        """Publish a sentence if it is new, and log it if it is a problem."""
         if said != self._said:
             self._said = said
             self._state.publish(String(data=said))
+            if said == self._problem:
+                self.get_logger().error(said)
 
     def _finish(self, _: Any) -> str:
         if self._is_training:
@@ -387,14 +404,19 @@ class TeachNode(LocalizationNode):
             raise LocalizationError(f'nothing was recorded yet{advice}')
         if self._worker is not None:
             self._worker.stop()
-        words = self._commands('train')
         self._end_recording()
+        return self._train()
+
+    def _train(self) -> str:
+        """Train on new drives. If this node ends meanwhile, the next start goes on with it."""
+        with suppress(OSError):  # the disk is full
+            self._finished.touch()
         drives = self._untaught()
-        update: list[str | Path] = ['--update', self._model] if self._model.exists() else []
+        way: list[str | Path] = ['--update', self._model] if self._model.exists() else ['--resume']
         self._is_training = True
         self._problem = ''
         outputs = '--output', self._model, '--json', self._judgment
-        self._worker = Worker([*words, *drives, *outputs, *update])
+        self._worker = Worker([*self._commands('train'), *drives, *outputs, *way])
         return f'training on {", ".join(map(str, drives))}; see teach/state'
 
     def _cancel(self, _: Any) -> str:
@@ -404,6 +426,7 @@ class TeachNode(LocalizationNode):
             self._worker.stop()
             self._worker = None
         self._is_training = False
+        self._finished.unlink(missing_ok=True)
         self._problem = ''
         self._end_recording()
         kept = ', '.join(map(str, self._untaught()))
@@ -420,6 +443,7 @@ class TeachNode(LocalizationNode):
     def _trained(self, worker: Worker) -> None:
         """Say how the training ended; the nodes get the model as soon as they are there."""
         self._is_training = False
+        self._finished.unlink(missing_ok=True)
         if worker.code:
             why = self._words(worker.failure())
             self._problem = f'training failed: {why}; the recording is kept for ~/finish'
