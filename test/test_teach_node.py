@@ -253,7 +253,9 @@ def test_only_what_was_not_taught_goes_on(bench, tmp_path):
     with mock.patch.object(node, 'get_logger', return_value=mock.Mock()) as logger:
         assert until(lambda: said[-1].data.startswith('training failed: ')), said[-1].data
         assert until(lambda: mock.call(said[-1].data) in logger().error.mock_calls)
-    assert '--' not in said[-1].data and 'kept for ~/finish' in said[-1].data
+    assert '--' not in said[-1].data and said[-1].data.endswith(
+        f'; {tmp_path}/garden_drive1: kept for ~/finish, or remove it'
+    )
     answer = call(bench, 'finish')
     assert answer.success and call(bench, 'cancel').success
     assert said[-1].data == f'canceled; {tmp_path}/garden_drive1: kept for ~/finish'

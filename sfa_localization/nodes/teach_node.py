@@ -446,7 +446,8 @@ class TeachNode(LocalizationNode):
         self._finished.unlink(missing_ok=True)
         if worker.code:
             why = self._words(worker.failure())
-            self._problem = f'training failed: {why}; the recording is kept for ~/finish'
+            kept = ', '.join(map(str, self._untaught()))
+            self._problem = f'training failed: {why}; {kept}: kept for ~/finish, or remove it'
             return
         judgment = json.loads(self._judgment.read_text())
         self._publish(f'{self._model} is written. {judgment["sentence"]}')
