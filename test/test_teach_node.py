@@ -320,8 +320,12 @@ def test_inputs_that_stop_or_have_two_publishers_are_named(bench, taught):
     bench.node.create_publisher(Imu, '/imu', 10)
     second = rclpy.create_node('second', context=bench.context)
     second.create_publisher(Odometry, '/odom', 10)
-    twice = 'bench and second publish on /odom: end all but one'
+    twice = 'bench and second publish on /odom, which is not recorded: end all but one'
     assert bench.publish_until('/odom', Odometry(), lambda: twice in said[-1].data)
+    recorded = taught._recorder.counts.copy()
+    heard = taught.monitors['/odom'].received
+    bench.publish_until('/odom', Odometry(), lambda: taught.monitors['/odom'].received > heard)
+    assert taught._recorder.counts == recorded
     second.destroy_node()
     assert until(lambda: twice not in said[-1].data)
     stopped = 'nothing comes from /odom'

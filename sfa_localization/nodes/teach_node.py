@@ -244,6 +244,8 @@ class TeachNode(LocalizationNode):
     def _write(self, topic: str, kind: str, data: bytes) -> None:
         if self._recorder is None or self._is_set_back:
             return
+        if self.count_publishers(topic) > 1 and not topic.endswith('/tf_static'):
+            return  # messages along two paths would spoil the whole drive
         now_ns = self.get_clock().now().nanoseconds
         if 0 < now_ns < self._recorder.end_ns - CLOCK_JUMP_NS:
             self._is_set_back = True
@@ -357,7 +359,7 @@ class TeachNode(LocalizationNode):
             for topic in sensors
         }
         return [f'nothing comes from {", ".join(sorted(silent))}'] * bool(silent) + [
-            f'{" and ".join(nodes)} publish on {topic}: end all but one'
+            f'{" and ".join(nodes)} publish on {topic}, which is not recorded: end all but one'
             for topic, nodes in names.items()
             if len(nodes) > 1
         ]
