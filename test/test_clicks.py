@@ -142,6 +142,8 @@ def shown(browser):
 def test_the_slider_and_the_buttons_of_the_worst_images(browser, evaluated):
     folder, _, moments = evaluated
     open_page(browser, folder, 1280, 'light')
+    marked = np.array(browser.execute_script(MARKED))
+    assert np.abs(marked - moments[0].seconds).max() < 2.0, 'the first image, from the start'
     move = (
         "const slider = document.querySelector('#moment'); slider.value = arguments[0];"
         "slider.dispatchEvent(new Event('input'));"

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from cylinder_worlds import SMALL_RECIPE
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from places import lengths
 from scipy import stats
 from test_inspection import write as write_drive
@@ -75,7 +75,10 @@ def test_the_page_of_a_training_answers_its_four_questions(reported):
         'Is my map good?', 'Where is it weak?', 'May I trust it?', 'What do I drive next?',
     ]  # fmt: skip
     assert {'Slow features', 'Worst images'} <= set(content.headings)
-    assert len(content.images) == len([*folder.glob('*.png')]) == 4
+    figures = [*folder.glob('*.png')]
+    assert len(content.images) == len(figures) == 4
+    corners = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[0, 0] for path in figures]
+    assert_array_equal(corners, np.uint8([[255, 255, 255, 0]] * 4))
     assert f'{result.model.quality["expected_error_m"]:.2f} m' in content.text
     assert ('Proven: ' in content.text) == result.model.quality['certified']
     errors = [image.error_m for image in worst]
@@ -232,7 +235,7 @@ def test_two_evaluations_are_shown_side_by_side(tmp_path, capsys):
     cells = ['0.100', '0.040', '0.200', '0.080', '-', '-']
     (row,) = (line for line in told.splitlines() if line.startswith('| EKF'))
     assert [cell.strip() for cell in row.split('|')[2:-1]] == cells
-    assert 'second: 0.04 <m>' in told and 'after.json: 0.04 <m>' in content.text
+    assert '2: 0.04 <m>' in told and '2, after.json: 0.04 <m>' in content.text
     assert all(cell in content.text for cell in cells)
     files[1].write_text('{"ekf": {"mean": 1}}')
     assert main(words) == 1

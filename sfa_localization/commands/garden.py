@@ -117,7 +117,8 @@ def work(garden: Garden) -> str:
             judgments = [training, *updates, *tests]
             result['tested'] = _tested(tests)
             error_m = model.quality['expected_error_m']
-            result['change_m'] = error_m - result.get('expected_error_m', error_m)
+            if 'expected_error_m' in result:
+                result['change_m'] = error_m - result['expected_error_m']
             result['expected_error_m'] = error_m
             result['area_m2'] = model.ground.cells(GroundConfig()).area_m2
             result['trained_s'] = (garden.output / TRAINING).stat().st_mtime

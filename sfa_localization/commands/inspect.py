@@ -95,9 +95,8 @@ def _write_report(folder: Path, reports: Sequence[BagReport], together: Sequence
             figures[target] = 'The path by odometry, with the images'
         if report.samples:
             target = folder / f'{file}_pictures.png'
-            title = f'{stem}: {report.image_topic}, {report.camera}'
-            write_contact_sheet(report.samples, title, target)
-            figures[target] = 'Images from all over the drive'
+            write_contact_sheet(report.samples, target)
+            figures[target] = f'Images from all over the drive: {report.image_topic}'
         facts = [': '.join(fact) for fact in report.facts.items()]
         sections += bag_sections(report.as_dict(), facts, figures)
     page.write_page(folder, 'What is in the recording', *sections)

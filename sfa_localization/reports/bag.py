@@ -23,12 +23,12 @@ def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
     """
     figure = Figure(figsize=SQUARE, layout='constrained')
     axes = figure.add_subplot()
-    axes.plot(poses[:, 0], poses[:, 1], color='0.8', linewidth=1, zorder=1)
+    axes.plot(poses[:, 0], poses[:, 1], color='0.6', linewidth=1, zorder=1)
     order = np.linspace(0, 100, len(places))
     dots = axes.scatter(places[:, 0], places[:, 1], c=order, s=5, cmap='viridis', zorder=2)
     axes.plot(*poses[0, :2], 'o', color='#D55E00', markersize=7, label='start', zorder=3)
     in_meters(axes, title, ' of the odometry')
-    axes.legend(loc='upper right')
+    axes.legend()
     figure.colorbar(dots, label='images, % of the drive', shrink=0.7)
     save(figure, path)
 

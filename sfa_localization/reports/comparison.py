@@ -15,7 +15,7 @@ from sfa_localization.reports.plots import Line, linked_plots
 Results = Mapping[str, Any]
 """What `evaluate --json` writes."""
 MEASURES = ('mean', 'p95', 'max')
-COLUMNS = tuple(f'{name}{which}' for name in MEASURES for which in ('', ', second'))
+COLUMNS = tuple(f'{name} {which}' for name in MEASURES for which in (1, 2))
 COLORS = {'sfa': '#56B4E9', 'ekf': '#0072B2'}, {'sfa': '#F0C05A', 'ekf': '#D55E00'}
 """Of the first result and of the second: blue and orange."""
 HEAD = ('position error (m)', *COLUMNS)
@@ -33,18 +33,18 @@ def comparison_rows(first: Results, second: Results) -> list[list[str]]:
 
 def comparison_text(first: Results, second: Results) -> str:
     """The table for a terminal, and both sentences."""
-    sentences = [f'first: {first["sentence"]}', f'second: {second["sentence"]}']
+    sentences = [f'1: {first["sentence"]}', f'2: {second["sentence"]}']
     return '\n'.join([markdown(HEAD, comparison_rows(first, second)), '', *sentences])
 
 
 def write_comparison_page(folder: Path, names: Sequence[str], results: Sequence[Results]) -> None:
     """Write `folder`/index.html about two results, by their names. Raises LocalizationError."""
     verdicts = [
-        page.verdict(result['grade'], f'{name}: {result["sentence"]}')
-        for name, result in zip(names, results, strict=True)
+        page.verdict(result['grade'], f'{row}, {name}: {result["sentence"]}')
+        for row, name, result in zip((1, 2), names, results, strict=True)
     ]
     table = page.table(HEAD, comparison_rows(*results))
-    title = f'{names[0]}, and second {names[1]}'
+    title = f'1: {names[0]}, 2: {names[1]}'
     page.write_page(
         folder,
         title,

@@ -14,13 +14,14 @@ from sfa_localization.reports import page
 
 STATES = {page.BAD: 'refused', page.WEAK: 'weak', page.GOOD: 'good'}
 """State of a garden by the worst grade of its judgments; the worst is first."""
-_COLUMNS = ('garden', 'state', 'why', 'tested error of the filter: mean (m)', '95 % below (m)',
+_COLUMNS = ('garden', 'state', 'pages', 'why',
+            'tested error of the filter: mean (m)', '95 % below (m)',
             'expected error of an image (m)', 'area (m2)',
-            'age of the training (days)', 'change of the error (m)', 'pages')  # fmt: skip
+            'age of the training (days)', 'change of the error (m)')  # fmt: skip
 _SCRIPT = """
 <style>body { max-width: none; } th { cursor: pointer; } td { vertical-align: top; }
-th:nth-child(-n+3), td:nth-child(-n+3) { text-align: left; }
-td:nth-child(3) { min-width: min(20rem, 40vw); }
+th:nth-child(-n+4), td:nth-child(-n+4) { text-align: left; }
+td:nth-child(4) { min-width: min(20rem, 40vw); }
 </style><script>
 const body = document.querySelector('tbody'), rows = [...body.rows];
 document.querySelector('thead').onclick = ({target}) => {
@@ -80,9 +81,9 @@ def _row(folder: Path, result: Mapping[str, Any], now_s: float) -> str:
     cells = [
         escape(name),
         result['state'],
+        ' '.join(f'<a href="{quote(f"{name}/{at}/{page.PAGE}")}">{escape(at)}</a>' for at in pages),
         '<br>'.join(map(escape, result['sentences'])),
         *('-' if value is None else format(value, form) for form, value in numbers),
-        ' '.join(f'<a href="{quote(f"{name}/{at}/{page.PAGE}")}">{escape(at)}</a>' for at in pages),
     ]
     columns = ''.join(f'<td>{cell}</td>' for cell in cells)
     return f'<tr class="{result["grade"]}">{columns}</tr>\n'

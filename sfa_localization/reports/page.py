@@ -30,7 +30,6 @@ _STYLE = """
   :root { --text: #ddd; --back: #181a1b; --line: #444; --dim: #aaa;
     --good: #173a24; --weak: #453512; --bad: #4a1c19; }
   a { color: #8ab4f8; }
-  figure img { filter: brightness(0.85); }
 }
 * { box-sizing: border-box; }
 body { font: 1rem/1.5 system-ui, sans-serif; color: var(--text); background: var(--back);
@@ -98,7 +97,7 @@ def embedded(picture: Image.Image, caption: str, quality: int = QUALITY) -> str:
     """A picture as a part of the page, compressed with this quality."""
     compressed = BytesIO()
     width, height = picture.size
-    picture.convert('RGB').save(compressed, 'WEBP', quality=quality)
+    picture.save(compressed, 'WEBP', quality=quality)
     data = base64.b64encode(compressed.getvalue()).decode()
     words = escape(caption)
     shape = ' broad' if width > BROAD * height else ''

@@ -49,8 +49,8 @@ _STYLE = """
 .moment figure { margin: 0.4rem 0; }
 .moment img { width: 100%; height: auto; }
 .moment figcaption { text-align: left; }
-.moment td { white-space: nowrap; }
 @media (max-width: 40rem) { .moment table { font-size: 0.75rem; width: 100%; } }
+@media (min-width: 40rem) { .moment td { white-space: nowrap; } }
 #moment { width: 100%; margin: 0; }
 button.at { font: inherit; color: inherit; background: none; border: 1px solid var(--line);
   border-radius: 0.25rem; padding: 0.1rem 0.5rem; margin: 0.15rem 0; cursor: pointer; }
@@ -80,7 +80,10 @@ function show(time) {
     trace => trace.customdata ? [nearest(trace.customdata, time)] : null)}));
 }
 plots.forEach(plot => plot.on('plotly_click', ({points}) => show(points[0].customdata)));
-if (slider) slider.oninput = () => show(times[slider.value]);
+if (slider) {
+  slider.oninput = () => show(times[slider.value]);
+  show(times[0]);
+}
 document.querySelectorAll('button.at').forEach(
   button => button.onclick = () => show(+button.dataset.seconds));
 if (matchMedia('(pointer: coarse)').matches)  // a finger scrolls the page
@@ -240,8 +243,8 @@ def _add_moments(figure: Figure, moments: Sequence[Moment]) -> None:
     x, y = np.array([moment.place for moment in moments]).T
     figure.add_trace(_marks('images', x, y, seconds, {'size': 8, **colors}))
     x, y = np.array([moment.keyframe[:2] for moment in moments]).T
-    diamonds = {'symbol': 'diamond-open', 'color': _RED, 'opacity': 0.0, 'size': 13}
-    figure.add_trace(_marks('likest keyframe', x, y, seconds, diamonds))
+    diamonds = {'symbol': 'diamond-open', 'color': _RED, 'size': 13}
+    figure.add_trace(_marks('likest keyframe', x, y, seconds, diamonds, others=0.0))
 
 
 def _error_plot(lines: Sequence[Line], moments: Sequence[Moment]) -> Figure:
@@ -290,12 +293,19 @@ def _line_trace(line: Line, x: Sequence[Any], y: Sequence[Any]) -> Scatter:
     return _trace(line.name, x, y, customdata=line.curve['seconds'], **look)
 
 
-def _marks(name: str, x: Any, y: Any, seconds: Sequence[Any], marker: dict[str, Any]) -> Scatter:
-    """Points, of which the one at the marked time is red and large."""
+def _marks(
+    name: str,
+    x: Any,
+    y: Any,
+    seconds: Sequence[Any],
+    marker: dict[str, Any],
+    others: float = 1.0,
+) -> Scatter:
+    """Points, of which the one at the marked time is red and large, with the opacity of others."""
     chosen = {'marker': {'color': _RED, 'size': 13, 'opacity': 1.0}}
-    others = {'marker': {'opacity': marker.get('opacity', 1.0)}}
+    rest = {'marker': {'opacity': others}}
     return _trace(name, x, y, mode='markers', customdata=seconds, marker=marker, selected=chosen,
-                  unselected=others)  # fmt: skip
+                  unselected=rest)  # fmt: skip
 
 
 def _trace(name: str, x: Any, y: Any, **look: Any) -> Scatter:
