@@ -366,6 +366,7 @@ def _counts(
         'fusion': dict(fused.counts),
         'states_s': dict(states_s),
         **_longest_silence(run, observations),
+        'drowned': float(np.mean([item.drowned for item in observations])),
         'nis': None if math.isnan(fused.nis) else fused.nis,
         **({'camera_delay_s': round(clock.delay_s, 3)} if clock.delay_ns else {}),
     }

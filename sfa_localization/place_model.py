@@ -18,6 +18,7 @@ from sfa_localization.camera.leveling import leveled
 from sfa_localization.camera.panorama import filled, repeated_columns
 from sfa_localization.camera.sectors import MountedCamera
 from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
+from sfa_localization.camera.watch import drowned_columns
 from sfa_localization.data.array_files import Arrays, read_arrays, read_header, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, LocalizationError, ModelError
@@ -134,10 +135,12 @@ class PlaceModel:
         return located(fits, slow, conditions.scales, self.keyframes.errors, tilt)
 
     def _comparable(self, panorama: Image) -> Keyframes:
-        """The keyframes, compared only where the panorama (H, W, 3) of several cameras shows more
-        than repeated columns: where a camera is missing.
+        """The keyframes, compared only where the panorama (H, W, 3) is not drowned in light, and
+        that of several cameras shows more than repeated columns: where a camera is missing.
         """
-        hidden = repeated_columns(panorama) if self.surround else np.zeros(1, bool)
+        hidden = drowned_columns(panorama)
+        if self.surround:
+            hidden = hidden | repeated_columns(panorama)
         if not hidden.any() or hidden.all():
             return self.keyframes
         return self.keyframes.seeing(np.broadcast_to(~hidden, panorama.shape[:2]))

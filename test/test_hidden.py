@@ -10,9 +10,11 @@ from cylinder_worlds import Spheres, alone, lanes, place, recipe, run_in, visit,
 from numpy.testing import assert_allclose
 from places import distances, lengths
 
+from sfa_localization import place_model
 from sfa_localization.camera.body import robot_in_view, seen_mask, sentences
 from sfa_localization.camera.panorama import Unwrapper, filled, repeated_pixels
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.camera.watch import drowned_columns
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.keyframes.hidden import (
     completed,
@@ -31,6 +33,7 @@ from sfa_localization.keyframes.texture import (
     turned,
 )
 from sfa_localization.keyframes.training import choose_keyframes, fit_among
+from sfa_localization.observer import Observer
 from sfa_localization.training import learn_place
 
 CONFIG = PanoramaConfig(width=120, height=24)
@@ -80,6 +83,25 @@ def test_keyframes_that_saw_all_locate_an_image_by_the_part_that_it_shows():
     unaware, _ = errors(whole)
     assert far < 0.06 and far < 0.5 * unaware
     assert turned_by < np.deg2rad(0.3)
+
+
+def test_columns_that_light_drowns_are_not_compared(monkeypatch):
+    """Those of a low sun: a white sky above the things around hides none of them."""
+    run = visit()
+    images = run.panoramas.read(0, len(run.panoramas)).copy()
+    images[0, : images.shape[1] // 2] = 255
+    assert not drowned_columns(images[0]).any()
+    images[:, :, 20:32] = 255
+    model = place().model
+
+    def far():
+        places = np.array([seen.pose[:2] for seen in model.locate_all(images)])
+        return lengths(places - run.odometry.poses[:, :2]).mean()
+
+    aware = far()
+    assert Observer(model).observe(0, images[0]).drowned == 12 / 72
+    monkeypatch.setattr(place_model, 'drowned_columns', lambda image: np.zeros(72, bool))
+    assert aware < 0.5 * far()
 
 
 @pytest.mark.parametrize('config', [CONFIG, replace(CONFIG, clockwise=False)])

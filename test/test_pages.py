@@ -152,6 +152,7 @@ def test_the_page_of_an_evaluation(trained, tmp_path):
     recipe = replace(SMALL_RECIPE, topics=TopicNames(ground_truth='/odom'))
     found = evaluate(model, trained.bag, recipe=recipe)
     counts = {**found.counts, 'images': {'used': 6, 'skipped': {'too <dark> & small': 3}}}
+    counts['drowned'] = 0.125
     counts['fusion'] = {'measurement: accepted': 9, 'measurement: outside the gate': 2}
     result = replace(found, counts=counts)
     features = result.estimates['sfa'].poses[:, :2], result.features
@@ -164,7 +165,7 @@ def test_the_page_of_an_evaluation(trained, tmp_path):
     ]  # fmt: skip
     for words in (
         'images: 6 used; 3 skipped: too <dark> & small', 'a <model>', 'aligned on a drive',
-        '2 times measurement: outside the gate',
+        '2 times measurement: outside the gate', 'light drowns 45 degrees of the view',
     ):  # fmt: skip
         assert words in content.text, 'escaped, and read back'
     shown = moments_of(result, model)

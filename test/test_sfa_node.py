@@ -100,6 +100,10 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
     told_of = node.health()[2]
     assert told_of['explained'] == '35 %', 'of the last image'
     assert told_of['slow feature errors'].endswith(' times as in training')
+    sun = panorama(PLACE, 4)
+    sun[:, 16:24] = 255
+    bench.publish('panorama', message(image=sun))
+    assert until(lambda: node.health()[1] == 'light drowns 45 degrees of the view')
     bench.publish('panorama', message(seed=3, stamp_ns=5_000_000_001 + NEAR_NS))
     assert until(lambda: len(turned) == 2), 'those between are not used'
     assert read_stamp(turned[1].header.stamp) == 5_000_000_001 + NEAR_NS

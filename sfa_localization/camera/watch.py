@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.data.geometry import Mask
 from sfa_localization.data.run import Image
 
 DARK_LEVEL = 8.0
@@ -24,6 +25,11 @@ FROZEN_S = 5.0
 EXPLAINED_WARNING = 0.4
 """Below this explained share an image is used with a warning; half-covered images have 0.15 to
 0.5."""
+DROWNED_WARNING = 10 / 360
+"""An image with a larger share of drowned columns is used with a warning; images in sun, clouds or
+low sun have none."""
+_WHITE = 250.0  # gray levels, of all channels
+_DROWNED = 0.7  # of a column is white; in the glare of a low sun, from 0.5 to 0.8 images err alike
 _STRIDE = 3  # every third pixel along each axis is compared
 
 
@@ -35,6 +41,18 @@ def frozen(repeats: int, count: int) -> str:
         f'{repeats} of {count} images repeat the one before: the camera was frozen; restart its '
         'driver, and record again'
     )
+
+
+def drowned_columns(panorama: Image) -> Mask:
+    """Which columns (W,) of a panorama (H, W, 3) uint8 are drowned in light: almost all white."""
+    return np.asarray(
+        cv2.inRange(panorama, (_WHITE,) * 3, (255.0,) * 3).mean(axis=0) >= 255 * _DROWNED
+    )
+
+
+def drowned_text(share: float) -> str:
+    """A sentence about the share of drowned columns."""
+    return f'light drowns {360 * share:.0f} degrees of the view'
 
 
 class FrozenWatch:

@@ -26,7 +26,7 @@ class Observation:
     covariance of an unusable one means that nothing is known. `turned` is the heading (rad, from
     any start) by the shifts between successive images, NaN for an unusable one: it needs no map,
     and shows the camera's delay. `tilt` (2,) rad is the roll and pitch of the robot, relative to
-    the training.
+    the training. `drowned` is the share of the columns that light drowns: they are not compared.
     """
 
     pose: Array
@@ -37,6 +37,7 @@ class Observation:
     problem: str = ''
     turned: float = math.nan
     tilt: Array = field(default_factory=lambda: np.zeros(2))
+    drowned: float = 0.0
 
     @property
     def position(self) -> Array:

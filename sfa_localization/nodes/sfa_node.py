@@ -23,7 +23,7 @@ from sfa_localization.camera.settings import (
     PanoramaConfig,
     WatchConfig,
 )
-from sfa_localization.camera.watch import EXPLAINED_WARNING
+from sfa_localization.camera.watch import DROWNED_WARNING, EXPLAINED_WARNING, drowned_text
 from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
@@ -225,7 +225,9 @@ class SfaNode(LocalizationNode):
         assert self._observer is not None
         values = {'model': self._config.model}
         explained = 1.0
+        drowned = 0.0
         if self._last is not None:
+            drowned = self._last.drowned
             explained = self._last.explained
             factor = self._observer.slow_error_factor
             values['explained'] = f'{100 * explained:.0f} %'
@@ -246,6 +248,8 @@ class SfaNode(LocalizationNode):
         if problem := self._camera_problem() or self._order_problem():
             self.get_logger().warning(problem, once=True)
             return WARN, problem, values
+        if drowned > DROWNED_WARNING:
+            return WARN, drowned_text(drowned), values
         if explained < EXPLAINED_WARNING:
             return WARN, 'images are unlike those of training', values
         return OK, 'locating', values

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sfa_localization.camera.watch import DROWNED_WARNING, drowned_text
 from sfa_localization.data.geometry import Array
 from sfa_localization.reports import page
 from sfa_localization.reports.figures import (
@@ -249,3 +250,5 @@ def _image_lines(counts: Mapping[str, Any]) -> Iterator[str]:
             f'images: none could be used from {start_s:.0f} s of the drive to {end}: '
             'does the camera stop, or is its view dark or covered there?'
         )
+    if (drowned := counts.get('drowned', 0.0)) > DROWNED_WARNING:
+        yield f'images: {drowned_text(drowned)}: drive at another hour, or shade the lens'
