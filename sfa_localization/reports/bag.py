@@ -28,7 +28,7 @@ def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
     dots = axes.scatter(places[:, 0], places[:, 1], c=order, s=5, cmap='viridis', zorder=2)
     axes.plot(*poses[0, :2], 'o', color='#D55E00', markersize=7, label='start', zorder=3)
     in_meters(axes, title, ' of the odometry')
-    axes.legend()
+    figure.legend(loc='outside lower center')
     figure.colorbar(dots, label='images, % of the drive', shrink=0.7)
     save(figure, path)
 

@@ -44,8 +44,8 @@ def save(figure: Figure, path: Path) -> None:
             part.set(color=_INK)
     for axes in figure.axes:
         axes.tick_params(color=_INK)
-        if legend := axes.get_legend():
-            legend.set_frame_on(False)
+    for legend in figure.legends:
+        legend.set_frame_on(False)
     with atomic_write(path) as file:
         figure.savefig(file, dpi=DOTS_PER_INCH, format='png', transparent=True)
 

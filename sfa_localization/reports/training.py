@@ -180,7 +180,7 @@ def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
         axes.plot([point['x_m'], at.real], [point['y_m'], at.imag], color=color)
         label = f'{point["name"]}: missed by {point["miss_m"]:.2f} m'
         axes.plot(point['x_m'], point['y_m'], '+', color=color, markersize=10, label=label)
-    axes.legend()
+    figure.legend(loc='outside lower center')
     figures.in_meters(axes, 'Images in the map, and the expected error between them')
     figures.save(figure, path)
 

@@ -49,6 +49,6 @@ def keyframes_figure(path: Path, keyframes: Sequence[tuple[str, Array]]) -> None
     for number, (name, poses) in enumerate(keyframes):
         style = {'markersize': 5} if number else {'markersize': 3, 'color': '0.7'}
         axes.plot(poses[:, 0], poses[:, 1], '.', **style, label=as_title(name))
-    axes.legend()
+    figure.legend(loc='outside lower center')
     in_meters(axes, 'Keyframes')
     save(figure, path)
