@@ -49,6 +49,7 @@ BASE = {
     'simulate --camera-radius': f'{CAMERAS} --camera-size 32x24',
     'simulate --camera-exposures': f'{CAMERAS} --camera-size 32x24',
     'simulate --camera-skew': f'{CAMERAS} --camera-size 32x24',
+    'simulate --camera-yaws': f'{CAMERAS} --camera-size 32x24',
     'simulate --test-drift': '{out}/bag --area 6x6 --trajectory test --size 32x8 --images-every 9',
     'train --strict': '{data}/cut --output {out}/model.npz --config {data}/small.yaml',
     'train --force': '{data}/bag --output {out}/model.npz --config {data}/counterclockwise.yaml',
@@ -65,7 +66,7 @@ CASES = {
         --speed 0.5; --odometry-rate 20; --test-drift 1; --scale-error 0.1; --slip 0.3
         --speed-noise 0.5; --gyro-bias 0.05; --gyro-noise 0.1
         --cameras 3; --camera-fov 190; --camera-radius 1; --camera-size 40x24
-        --camera-exposures 1x0.5; --camera-skew 0x33""",
+        --camera-exposures 1x0.5; --camera-skew 0x33; --camera-yaws 0x10""",
     'train': """
         --output {out}/other.npz; --config {data}/fewer.yaml; --report {out}/report; --resume
         --json {out}/judgment.json

@@ -7,6 +7,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from places import distances, lengths
 from rosbags.interfaces import QosDurability
 from scipy.spatial.transform import Rotation
@@ -322,10 +323,22 @@ def test_cameras_differ_by_place_exposure_and_time_as_asked(tmp_path, tiny):
         assert np.abs(image.astype(float) - rounded(picture)).mean() < 0.1
 
 
+def test_a_camera_looks_further_left_than_its_pose_says_as_asked(tiny):
+    config = replace(FOUR, cameras=2, camera_radius=0.0, camera_size=(64.0, 48.0))
+    stated = simulated_cameras(config)
+    true = simulated_cameras(replace(config, camera_yaws=(0.0, 10.0)))
+    assert [camera.mounted for camera in true] == [camera.mounted for camera in stated]
+    pose = np.array([1.0, 2.0, 0.3])
+    left = pose + np.array([0.0, 0.0, np.radians(10.0)])
+    assert_allclose(tiny.image(pose, true[1].view), tiny.image(left, stated[1].view), atol=0.5)
+    assert_array_equal(tiny.image(pose, true[0].view), tiny.image(pose, stated[0].view))
+
+
 @pytest.mark.parametrize(
     ('settings', 'text'),
     [
         ({'camera_skew': (0.0, 1.0)}, 'camera_skew: 2 numbers for 4 cameras'),
+        ({'camera_yaws': (1.0,)}, 'camera_yaws: 1 numbers for 4 cameras'),
         ({'camera_exposures': (1.0,)}, 'camera_exposures: 1 numbers for 4 cameras'),
         ({'camera_size': (64.0,)}, 'camera_size: give columns x rows'),
         ({'images': 'panorama'}, 'leave it or cameras out'),

@@ -11,6 +11,7 @@ import numpy as np
 from sfa_localization.camera.lenses import turned_camera
 from sfa_localization.camera.sectors import MountedCamera, optical_pose
 from sfa_localization.camera.settings import LensCalibration
+from sfa_localization.camera.yaws import turned
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.sphere import directions
 from sfa_localization.simulation.garden import CAMERA_HEIGHT_M
@@ -25,19 +26,21 @@ NAMES = {2: ('front', 'rear'), 4: ('front', 'left', 'rear', 'right')}
 @dataclass(frozen=True, slots=True)
 class SimulatedCamera:
     """A camera on the robot. Its images are `exposure` times as bright as others, and are taken
-    `skew_ns` later than planned.
+    `skew_ns` later than planned; it looks `yaw_deg` further left than it is `mounted` on paper.
     """
 
     mounted: MountedCamera
     exposure: float
     skew_ns: int
+    yaw_deg: float
 
     @property
     def view(self) -> View:
         """The kind of its images."""
         lens = self.mounted.lens
         size = lens.image_height, lens.image_width
-        model = turned_camera(lens, size, np.array(self.mounted.rotation))
+        true = turned(self.mounted, np.radians(self.yaw_deg))
+        model = turned_camera(lens, size, np.array(true.rotation))
         plain = pixel_view(model.unproject, size, 1.0 / lens.fx)
         exposure = np.float32(self.exposure)
         return View(plain.dome, lambda dome, gain: plain.image(dome, gain * exposure))
@@ -61,6 +64,7 @@ def simulated_cameras(config: SimulationConfig) -> list[SimulatedCamera]:
     names = NAMES.get(count, tuple(f'camera{number}' for number in range(count)))
     exposures = _each(config.camera_exposures, 1.0, count, 'camera_exposures')
     skews_ms = _each(config.camera_skew, 0.0, count, 'camera_skew')
+    yaws_deg = _each(config.camera_yaws, 0.0, count, 'camera_yaws')
     lens = lens_of(config)
     cameras = []
     for number, name in enumerate(names):
@@ -68,7 +72,8 @@ def simulated_cameras(config: SimulationConfig) -> list[SimulatedCamera]:
         x, y, _ = config.camera_radius * directions(np.radians(yaw_deg), 0.0)
         pose = optical_pose((x, y, CAMERA_HEIGHT_M), (0.0, 0.0, yaw_deg))
         mounted = MountedCamera.at(name, lens, pose)
-        cameras.append(SimulatedCamera(mounted, exposures[number], round(1e6 * skews_ms[number])))
+        skew_ns = round(1e6 * skews_ms[number])
+        cameras.append(SimulatedCamera(mounted, exposures[number], skew_ns, yaws_deg[number]))
     return cameras
 
 

@@ -64,6 +64,13 @@ class SimulationConfig(Settings):
         low=-400.0,
         high=400.0,
     )
+    camera_yaws: tuple[float, ...] = setting(
+        (),
+        'how much further left each camera looks than /tf_static says; empty: as it says',
+        unit='deg',
+        low=-180.0,
+        high=180.0,
+    )
     images_every: float = setting(0.2, 'distance between images', unit='m', low=0.02, high=10.0)
     images_every_turn: float = setting(
         30.0, 'turn on the spot between images', unit='deg', low=1.0, high=360.0
