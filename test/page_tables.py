@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / 'README.md', *sorted(ROOT.glob('test/*.md')))
+PAGES = (ROOT / 'README.md', ROOT / 'config' / 'cameras.md', *sorted(ROOT.glob('test/*.md')))
 
 
 def markdown(header, rows):

@@ -13,7 +13,7 @@ import page_tables
 import pytest
 from places import lengths
 from study import __main__ as studies
-from study import comparisons, light, page, results, sites, year
+from study import cameras, comparisons, light, page, results, sites, year
 from study.comparisons import BASELINES, VARIANTS
 from study.half_real import given_drive
 from study.results import Results
@@ -22,6 +22,7 @@ from study.tables import NAMES
 
 from sfa_localization import __version__
 from sfa_localization.bags.drives import read_drive
+from sfa_localization.bags.reader import Bag
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.run import Odometry, Trajectory
 from sfa_localization.simulation.drive import START_NS
@@ -29,7 +30,8 @@ from sfa_localization.simulation.settings import SimulationConfig
 
 MINUTES = dict.fromkeys(NAMES, 1)
 PLAN = SitePlan((6.0, 6.0), (160, 16), {'coverage': 150, 'lines': 120, 'mower': 200}, MINUTES)
-NAMED = {'ablations': 'paper', 'baselines': 'paper', 'light': 'light', 'year': 'year'}
+NAMED = {'ablations': 'paper', 'baselines': 'paper', 'light': 'light', 'year': 'year',
+         'cameras': 'cameras'}  # fmt: skip
 MONTHS = (('July', 'day', 'summer'), ('August', 'evening', 'summer'))
 EVERYTHING = next(iter(VARIANTS))
 
@@ -48,6 +50,8 @@ def made(tmp_path_factory, gardens, small_network):
         patch.setattr(studies, 'QUICK', PLAN)
         patch.setattr(sites, 'SMALL_AREA', PLAN.area)
         patch.setattr(sites, 'SMALL_PANORAMA', PLAN.panorama)
+        patch.setattr(cameras, 'AREA', PLAN.area)
+        patch.setattr(cameras, 'PANORAMA', PLAN.panorama)
         patch.setattr(light, 'TESTS', [(when, season) for _, when, season in MONTHS])
         patch.setattr(year, 'QUICK_MONTHS', MONTHS)
         # Few messages are enough, and quicker to write and read.
@@ -85,8 +89,22 @@ def test_lights_and_months_are_judged_before_anything_is_learned(made):
 
 
 @pytest.mark.study
+def test_rigs_are_judged_with_what_happens_to_a_camera(made, tmp_path):
+    (cell,) = cells(made / 'cameras' / 'cameras.json')
+    assert cell['case'] == 'two fisheyes' and 0 < cell['ekf'] < 1.5
+    bag = next((made / 'cameras').glob('garden_*/rig_0/test'))
+    gone = cameras.without_rear(bag, tmp_path / 'gone', (1.0, 2.0))
+    topic = '/rear/image_raw/compressed'
+    with Bag(bag) as whole, Bag(gone) as rest:
+        lost = whole.topics[topic].count - rest.topics[topic].count
+        assert 0 < lost < whole.topics[topic].count
+        assert whole.topics['/odom'].count == rest.topics['/odom'].count
+
+
+@pytest.mark.study
 def test_what_is_finished_is_not_made_again(made, monkeypatch, capsys):
     for module, step in ((results, 'simulate'), (light, 'evaluate'), (sites, 'train'),
+                         (cameras, 'train'),
                          (comparisons, 'evaluate')):  # fmt: skip
         monkeypatch.setattr(module, step, mock.Mock(side_effect=AssertionError))
     made_in(made)

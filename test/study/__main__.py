@@ -19,19 +19,31 @@ from pathlib import Path
 from sfa_localization.cli import guarded
 from sfa_localization.commands.options import add_settings, settings
 from sfa_localization.data.errors import ConfigError
-from study import bags, half_real, large, light, light_report, page, rig, year, year_report
+from study import (
+    bags,
+    cameras,
+    half_real,
+    large,
+    light,
+    light_report,
+    page,
+    rig,
+    year,
+    year_report,
+)
 from study.results import Progress, StudyConfig
 from study.sites import FULL, QUICK
 from study.tables import NAMES, Work
 
 STUDIES = {
-    'all': 'the next eight, which take hours, and their page',
+    'all': 'the next nine, which take hours, and their page',
     'simulator': "the paper's experiment in its simulator",
     'robot': "the paper's experiment with a robot, simulated",
     'baselines': 'other features instead of slow features',
     'ablations': 'this package without some of its parts',
     'light': 'train by day in summer, test in every light and season',
     'rig': 'a camera ahead of the axle, and uneven ground',
+    'cameras': 'several cameras around the robot, and what happens to one of them',
     'year': 'train once, then drive each month, with and without updates of the model',
     'large': 'gardens of 16 m x 18 m to 64 m x 72 m, at one density of drives',
 }
@@ -66,7 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser, name: str) -> None:
         type=Path,
         metavar='DIR',
         help='folder to write, or one with the same settings to go on with [study_paper, '
-        'study_light, study_rig, study_year, study_large; with --quick study_quick_paper...]',
+        'study_light, study_rig, study_cameras, study_year, study_large; with --quick '
+        'study_quick_paper...]',
     )
     parser.add_argument(
         '--quick', action='store_true', help='a smaller garden, smaller images, fewer months'
@@ -123,6 +136,9 @@ def _other(name: str, out: Path, arguments: argparse.Namespace) -> str:
     if name == 'rig':
         cases = rig.QUICK_CASES if quick else rig.CASES
         return rig.table(rig.judge_rigs(out, config, cases, progress))
+    if name == 'cameras':
+        rigs = cameras.QUICK_RIGS if quick else cameras.RIGS
+        return cameras.table(cameras.judge_cameras(out, config, rigs, progress))
     if name == 'year':
         months = year.QUICK_MONTHS if quick else year.MONTHS
         return year_report.table(year.judge_year(out, config, months, progress))

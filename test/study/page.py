@@ -27,7 +27,7 @@ from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.files import atomic_write
 from sfa_localization.reports.evaluation import tables as tables_of
 from sfa_localization.reports.figures import save_text
-from study import bags, large, light, light_report, overview, rig, year, year_report
+from study import bags, cameras, large, light, light_report, overview, rig, year, year_report
 from study import tables as paper_tables
 from study.paper import RECIPES
 from study.results import Cell
@@ -39,7 +39,7 @@ RECORD, FIGURES = TESTS / 'reproduced.json', TESTS / 'figures'
 FILES = {
     **{f'{name}.json': name for name in paper_tables.NAMES},
     light.RESULTS: 'light', year.RESULTS: 'year', large.RESULTS: 'large', rig.RESULTS: 'rig',
-    bags.RESULTS: 'bags', 'real.json': 'real', MARKER: 'demo',
+    cameras.RESULTS: 'cameras', bags.RESULTS: 'bags', 'real.json': 'real', MARKER: 'demo',
 }  # fmt: skip
 """Results by their files; real.json is of benchmarks/bench_real.py."""
 NAMES = (
@@ -166,7 +166,8 @@ def tables(results: Mapping[str, Sequence[Cell]]) -> dict[str, str]:
     """The tables of the page by their names, '' where there are no cells."""
     makers = {
         **{name: partial(paper_tables.table, name) for name in paper_tables.NAMES},
-        'light': light_report.table, 'rig': rig.table, 'year': year_report.table,
+        'light': light_report.table, 'rig': rig.table,
+        'cameras': cameras.table, 'year': year_report.table,
         'large': large.table, 'bags': bags.table, 'real': real_table,
     }  # fmt: skip
     texts = {
