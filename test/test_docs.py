@@ -38,7 +38,7 @@ PAGES = {
     for path in ROOT.glob(pattern)
 }
 EVALUATION = 'test/EVALUATION.md'
-STUDIES = PAGES[EVALUATION] + PAGES['test/PAPER.md']
+STUDIES = PAGES[EVALUATION] + PAGES['test/PAPER.md'] + PAGES['config/cameras.md']
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 BLOCK = re.compile(r'```(?:bash|sh)\n(.*?)```', re.DOTALL)
 INLINE = re.compile(r'`((?:sfa_localization|make) [^`]+)`')
