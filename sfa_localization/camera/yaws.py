@@ -39,9 +39,9 @@ _SEARCHED_DEG = 15.0  # around the expected azimuth
 _FEWEST_DEG = 15.0  # of the overlap of two views
 _ALIKE = 0.6  # correlation of views of one thing
 _STRANGE = 0.1
-# of a camera's views are alike what others saw, at most, if it shows something else: of cameras in
-# two gardens 74 to 100 %, of one with random pixels none
-_FEWEST_VIEWS = 12  # of a camera, that show so
+# of the views of two cameras are alike, at most, if these show different things: 57 to 100 % in two
+# gardens, with random pixels none, and with exchanged images 8 % at most
+_FEWEST_VIEWS = 12  # that show so
 _WHOLE = 0.95  # of the rows of a column that is compared
 # standard deviations: of yaws as people measure them, of turns by odometry, of an azimuth, rad; of
 # the inverse distance of things, 1/m
@@ -230,8 +230,7 @@ class YawComparison:
     def fit(self, sightings: Sequence[Sighting]) -> Yaws:
         """The errors of all yaws, by sightings, and strange cameras."""
         yaws = self._fit([seen for seen in sightings if np.isfinite(seen.shift)])
-        strange = tuple(name for name in self._cameras if _is_strange(name, sightings))
-        return replace(yaws, strange=strange)
+        return replace(yaws, strange=_strange([*self._cameras], sightings))
 
     def _fit(self, sightings: Sequence[Sighting]) -> Yaws:
         """The errors of all yaws, by what cameras see alike: a ridge regression whose weights are
@@ -271,13 +270,24 @@ class YawComparison:
         return design
 
 
-def _is_strange(name: str, sightings: Sequence[Sighting]) -> bool:
-    """Whether a camera shows nothing that others see, while most views of others are alike."""
-    own = [np.isfinite(seen.shift) for seen in sightings if name in seen[:2]]
-    rest = [np.isfinite(seen.shift) for seen in sightings if name not in seen[:2]]
-    if len(own) < _FEWEST_VIEWS or not rest:
-        return False
-    return bool(np.mean(own) <= _STRANGE and np.mean(rest) > 0.5)
+def _strange(names: Sequence[str], sightings: Sequence[Sighting]) -> tuple[str, ...]:
+    """Cameras that show nothing of what the others see, while most views of these are alike."""
+    from scipy.sparse.csgraph import connected_components  # for several cameras alone
+
+    views = np.zeros((len(names), len(names)))
+    alike = np.zeros_like(views)
+    for seen in sightings:
+        pair = names.index(seen.first), names.index(seen.second)
+        views[pair] += 1
+        alike[pair] += np.isfinite(seen.shift)
+    both = views + views.T
+    count, group = connected_components(alike + alike.T > _STRANGE * both)
+    within = [alike[group == k][:, group == k].sum() for k in range(count)]
+    trusted = group == np.argmax(within)
+    certain = both[trusted][:, ~trusted].sum() >= _FEWEST_VIEWS
+    if not certain or max(within) <= 0.5 * views[trusted][:, trusted].sum():
+        return ()
+    return tuple(name for name, is_trusted in zip(names, trusted, strict=True) if not is_trusted)
 
 
 def _both(one: Texture, other: Texture, offset: int) -> tuple[int, int]:

@@ -65,8 +65,10 @@ PROMISES = {
         ('one of several cameras that is dark, frozen or silent',
          'its sector is hidden; named, after 3 s in a state DEGRADED'),
     'test_surround_bags.py::test_a_camera_that_shows_nothing_of_what_others_see_is_named':
-        ('one of several cameras that shows other things, as of dirt or random pixels',
+        ('one of several cameras that shows other things: dirt, random pixels',
          'named by `evaluate` and live; DEGRADED'),
+    'test_surround_bags.py::test_cameras_whose_images_were_exchanged_are_named':
+        ('cameras that have exchanged their topics', 'named by `evaluate` and live; DEGRADED'),
     'test_silence.py::test_a_drive_without_one_of_several_cameras_is_degraded_as_live':
         ('the same in a bag', 'states are those of the nodes'),
     'test_surround_input.py::test_an_image_of_another_camera_is_refused_and_the_others_go_on':
