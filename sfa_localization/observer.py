@@ -12,7 +12,7 @@ import numpy as np
 
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import VisualGyro
-from sfa_localization.camera.watch import ImageWatch, drowned_columns
+from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import LARGEST_VARIANCE
@@ -59,8 +59,8 @@ class Observer:
         judged = [self._judge(panorama) for panorama in panoramas]
         views = self.model.views(panoramas)
         return [
-            replace(self._locate(view, problem), stamp_ns=stamp_ns, turned=turned, drowned=drowned)
-            for stamp_ns, (problem, turned, drowned), view in zip(
+            replace(self._locate(view, problem), stamp_ns=stamp_ns, turned=turned)
+            for stamp_ns, (problem, turned), view in zip(
                 stamps_ns.tolist(), judged, views, strict=True
             )
         ]
@@ -72,13 +72,10 @@ class Observer:
             yield from self.observe_all(run.panoramas.stamps_ns[start : start + len(batch)], batch)
             start += len(batch)
 
-    def _judge(self, panorama: Image) -> tuple[str, float, float]:
-        """The problem of the next image, the turn of the camera since the first one, rad, and the
-        share of its columns that light drowns.
-        """
+    def _judge(self, panorama: Image) -> tuple[str, float]:
+        """The problem of the next image, and the turn of the camera since the first one, rad."""
         problem = self.watch.judge(panorama)
-        turned = math.nan if problem else self._gyro.add(panorama)
-        return problem, turned, float(drowned_columns(panorama).mean())
+        return problem, math.nan if problem else self._gyro.add(panorama)
 
     def _locate(self, view: View, problem: str) -> Observation:
         """Locate an image in the recent light; a usable image updates the estimate of the light.

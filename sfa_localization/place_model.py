@@ -22,7 +22,7 @@ from sfa_localization.camera.watch import drowned_columns
 from sfa_localization.data.array_files import Arrays, read_arrays, read_header, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, LocalizationError, ModelError
-from sfa_localization.data.geometry import Array, Indices
+from sfa_localization.data.geometry import Array, Indices, Mask
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.rig import Rig
 from sfa_localization.data.run import Image, Origin
@@ -59,12 +59,13 @@ _REMEDY = 'train it with the train command'
 @dataclass(frozen=True, slots=True)
 class View:
     """What an image shows before its heading is known: the `upright` image, its slow features (K,),
-    and the `spectrum` (H, J) of the layer that is turned.
+    the `spectrum` (H, J) of the layer that is turned, and which columns (W,) light has drowned.
     """
 
     upright: UprightImage
     slow_features: Array
     spectrum: Spectrum
+    drowned: Mask
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,25 +123,27 @@ class PlaceModel:
     def views(self, panoramas: Image) -> list[View]:
         """Textures of panoramas (T, H, W, 3), leveled by keyframes."""
         require_size(panoramas, self.network.architecture)
-        level = [upright(self._comparable(image), image) for image in panoramas]
+        drowned = [drowned_columns(image) for image in panoramas]
+        level = [
+            upright(self._comparable(image, columns), image)
+            for image, columns in zip(panoramas, drowned, strict=True)
+        ]
         maps = self.network.maps(np.stack([image.panorama for image in level]))
         spectra = spectrum(maps[min(TURNED_LAYER, len(maps) - 1)])
-        return list(map(View, level, slow_features(maps), spectra))
+        return list(map(View, level, slow_features(maps), spectra, drowned))
 
     def located(self, view: View, conditions: Conditions) -> Location:
         """Where the camera was, by keyframes and slow features in the current conditions."""
-        keyframes = self._comparable(view.upright.seen)
+        keyframes = self._comparable(view.upright.seen, view.drowned)
         fits, tilt = hypotheses(keyframes, view.upright, conditions.pattern)
         slow = self._slow_places(view, fits)
         return located(fits, slow, conditions.scales, self.keyframes.errors, tilt)
 
-    def _comparable(self, panorama: Image) -> Keyframes:
+    def _comparable(self, panorama: Image, drowned: Mask) -> Keyframes:
         """The keyframes, compared only where the panorama (H, W, 3) is not drowned in light, and
         that of several cameras shows more than repeated columns: where a camera is missing.
         """
-        hidden = drowned_columns(panorama)
-        if self.surround:
-            hidden = hidden | repeated_columns(panorama)
+        hidden = drowned | repeated_columns(panorama) if self.surround else drowned
         if not hidden.any() or hidden.all():
             return self.keyframes
         return self.keyframes.seeing(np.broadcast_to(~hidden, panorama.shape[:2]))
@@ -170,9 +173,14 @@ class PlaceModel:
         covariance[:2, :2] += np.outer(by_scale, by_scale)
         pose, covariance = self.rig.base(location.pose, covariance, location.facing)
         covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
-        explained = location.fit.explained
-        tilt = location.tilt
-        return Observation(pose, covariance, view.slow_features, explained, tilt=tilt)
+        return Observation(
+            pose,
+            covariance,
+            view.slow_features,
+            location.fit.explained,
+            tilt=location.tilt,
+            drowned=float(view.drowned.mean()),
+        )
 
     def save(self, path: Path) -> None:
         """Write to `path` completely or not at all; the same model gives the same bytes."""

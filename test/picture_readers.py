@@ -10,6 +10,7 @@ from filter_drives import FilterDrive
 
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
+from sfa_localization.camera.watch import drowned_columns
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.rig import Rig
@@ -85,7 +86,8 @@ class PictureReader:
         spread = np.diag([0.02, 0.03, 0.002]) * max(0.6 / max(explained, 0.01), 1.0) ** 2
         pose = np.append(position, yaw if self.heading else 0.0)
         spread[2, 2] = spread[2, 2] if self.heading else UNKNOWN_YAW_VARIANCE
-        return Observation(pose, spread, pose, explained)
+        drowned = float(drowned_columns(image).mean())
+        return Observation(pose, spread, pose, explained, drowned=drowned)
 
 
 def load_pictures(monkeypatch):

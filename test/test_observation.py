@@ -108,7 +108,8 @@ class Matched(PictureReader):
         self.keyframes = SimpleNamespace(errors=errors, poses=np.array([[*center, 0.0]]))
 
     def views(self, images):
-        return [SimpleNamespace(slow_features=np.zeros(2))] * len(images)
+        view = SimpleNamespace(slow_features=np.zeros(2), drowned=np.zeros(1, bool))
+        return [view] * len(images)
 
     def located(self, view, conditions):
         fit = fit_at([0.0, 0.0], 1 / (1 + self.unlike), variance=0.1**2, outward=0.2)
