@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.spines import Spine
 from matplotlib.text import Text
 
@@ -44,7 +45,7 @@ def save(figure: Figure, path: Path) -> None:
             part.set(color=_INK)
     for axes in figure.axes:
         axes.tick_params(color=_INK)
-    for legend in figure.legends:
+    for legend in figure.findobj(Legend):
         legend.set_frame_on(False)
     with atomic_write(path) as file:
         figure.savefig(file, dpi=DOTS_PER_INCH, format='png', transparent=True)
