@@ -422,7 +422,7 @@ def test_a_camera_that_was_turned_since_training_is_named_while_the_robot_turns(
         images = {c.name: picture(c, speckled, heading) for c in true}
         for name, image in images.items():
             surround.add(name, at, image)
-        surround._yaws.finish()
+        surround.finish()
     (sentence_of_left,) = surround.knocked
     assert sentence_of_left.startswith('camera left looks 10.')
     assert sentence_of_left.endswith('to the left of what it was in training')

@@ -277,9 +277,8 @@ def test_a_camera_that_shows_nothing_of_what_others_see_is_named():
 
     assert strangers(10, damaged) == ['rear'] and strangers(3, damaged) == []
     assert strangers(10, lambda one, other: damaged(one, other) or 0.3) == []
-    assert (
-        strangers(10, lambda one, other: 0.4 * damaged(one, other)) == []
-    )  # hardly anything to see
+    # Where hardly anything is to be seen.
+    assert strangers(10, lambda one, other: 0.4 * damaged(one, other)) == []
 
 
 def test_cameras_whose_images_were_exchanged_are_named():

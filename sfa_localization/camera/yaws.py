@@ -38,9 +38,9 @@ _WIDE_DEG = 36.0  # wider structures are light
 _SEARCHED_DEG = 15.0  # around the expected azimuth
 _FEWEST_DEG = 15.0  # of the overlap of two views
 _ALIKE = 0.6  # correlation of views of one thing
-_STRANGE = 0.1
 # of the views of two cameras are alike, at most, if these show different things: 57 to 100 % in two
 # gardens, with random pixels none, and with exchanged images 8 % at most
+_STRANGE = 0.1
 _FEWEST_VIEWS = 12  # that show so
 _WHOLE = 0.95  # of the rows of a column that is compared
 # standard deviations: of yaws as people measure them, of turns by odometry, of an azimuth, rad; of

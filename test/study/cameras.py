@@ -83,13 +83,13 @@ def judge_cameras(
             odometry_rate=25.0,
             test_drift=usual_drift(AREA),
         )
-        for case, (name, settings) in enumerate(rigs.items()):
-            folder = out / f'garden_{world}' / f'rig_{case}'
-            tests = [name, *GONE, KNOCKED] if settings == FOUR else [name]
+        for place, (name, rig) in enumerate(rigs.items()):
+            folder = out / f'garden_{world}' / f'rig_{place}'
+            tests = [name, *GONE, KNOCKED] if rig == FOUR else [name]
             names = [{'world': world, 'case': test} for test in tests]
             missing = [cell for cell in names if results.find(**cell) is None]
             if missing:
-                _judge(folder, replace(base, **settings), missing, results, progress)
+                _judge(folder, replace(base, **rig), missing, results, progress)
     return results.cells
 
 
